@@ -54,7 +54,7 @@ from .children import (
 from .decisions import affected, decide, is_reported
 from .errands import Errand, answered
 from .inquiries import Inquiries
-from .intensity import admit_restart, recent_restarts
+from .intensity import CountedCauses, admit_restart, recent_restarts
 from .spec import ChildSpec, Flags, Plan, check_spec
 from .supervisor_changes import (
     Bequest,
@@ -89,6 +89,7 @@ class Supervisor(Inquiries):
     _template: ChildSpec | None = None  # of children that are started by their arguments
     _flags: Flags
     _restarts: tuple[float, ...]
+    _causes: CountedCauses
     _planned: frozenset[str]
     _parked: set[str]
     _dismissed: dict[str, None]
@@ -159,7 +160,7 @@ class Supervisor(Inquiries):
         self._children = {spec.id: Child(spec) for spec in plan.children}
         self._planned, self._parked = frozenset(self._children), set[str]()
         self._dismissed, self._ended = {}, {}
-        self._restarts = ()
+        self._restarts, self._causes = (), CountedCauses()
         self._early: list[lifecycle.ChildExit] = []
 
     def _is_starting(self) -> bool:
@@ -345,8 +346,11 @@ class Supervisor(Inquiries):
         one.up_since = self.ctx._cell.node.loop.time()
 
     def _start_failed(self, one: Child, error: HoldfastError) -> None:
-        one.state, one.row = STOPPED, None
+        one.state, one.row, one.lost_by = STOPPED, None, None
         if one.cell is not None:
+            last = one.cell.extra().reason
+            if one.cell.life > one.ignored_life and last.common_cause:
+                one.lost_by = last  # The life that was begun has ended, and not by its own fault.
             one.ignored_life = one.cell.life
         node = self.ctx._cell.node
         if node.events.has_listeners:
@@ -492,12 +496,14 @@ class Supervisor(Inquiries):
         """One attempt by the strategy, counted; gives up when there were too many."""
         node, flags = self.ctx._cell.node, self._flags
         now, intensity, period = node.loop.time(), flags.intensity, flags.period
-        window = admit_restart(self._restarts, now, intensity=intensity, period=period)
+        window: tuple[float, ...] | None = recent_restarts(self._restarts, now, period)
+        if not self._causes.is_counted(reason.common_cause, one.spec.id, now, period):
+            window = admit_restart(self._restarts, now, intensity=intensity, period=period)
         own = admit_restart(one.restarts, now - one.away, intensity=intensity, period=period)
         if window is None or own is None:
             slow = "" if window is None else f", not counting the {one.away:.0f} s that restarts have taken"
             why = f"restart intensity reached{slow}; the last to end was {self._path_of(one)}: {reason}"
-            self._give_up(one, reason, Shutdown(why))
+            self._give_up(one, reason, Shutdown(why, reason.common_cause))
             return
         self._restarts, one.restarts = window, own
         if one.spec.is_supervisor:  # Perhaps it has ended because of somebody below it: that one comes back as it says.
@@ -505,7 +511,7 @@ class Supervisor(Inquiries):
         if node.events.has_listeners:
             node.emit(ChildRestarted(self._path_of(one), reason, len(window), flags.intensity))
         order = list(self._children.values())
-        group = affected(flags.strategy, order, order.index(one))
+        group = affected(flags.strategy, order, order.index(self._first_struck(one, reason)))
         wanted = [
             other
             for other in group
@@ -513,10 +519,18 @@ class Supervisor(Inquiries):
         ]
         self._errand(self._restart_group(one, wanted, now))
 
+    def _first_struck(self, one: Child, reason: ExitReason) -> Child:
+        """The first of the children that are restarted because of what has ended this one: one restart is for all."""
+        cause = reason.common_cause
+        if not cause or self._flags.strategy == "one_for_one":
+            return one
+        return next(other for other in self._children.values() if other is one or _has_ended_by(other, cause))
+
     def _give_up(self, one: Child, reason: ExitReason, told: ExitReason) -> None:
         """We end: too many restarts, or a rule says that this end is one for whoever is above us."""
         one.state = STOPPED
-        self._blame(one, str(reason))
+        if not reason.common_cause:
+            self._blame(one, str(reason))
         node = self.ctx._cell.node
         node.supervised.gave_up = SupervisorGaveUp(self.ctx.path, one.spec.id, reason)
         node.emit(node.supervised.gave_up)
@@ -569,7 +583,9 @@ class Supervisor(Inquiries):
                 await self._come_up_in(row, other)
             except HoldfastError as error:
                 row.leave()
-                self._again(other, crash(error))  # The others stay up, or are stopped, until it is tried again.
+                self._again(
+                    other, other.lost_by or crash(error)
+                )  # The others stay up, or are stopped, until it is tried again.
 
     def _again(self, one: Child, reason: ExitReason) -> None:
         """A start has failed: try once more, which counts, unless only other code can help."""
@@ -928,6 +944,14 @@ class Supervisor(Inquiries):
     def _specs(self) -> tuple[ChildSpec, ...]:
         """The specs as they are now."""
         return tuple(one.spec for one in self._children.values())
+
+
+def _has_ended_by(one: Child, cause: str) -> bool:
+    """Whether a child has ended by a common cause, and is to be restarted at once."""
+    if one.state != UP or one.cell is None or one.cell.state is not DOWN:
+        return False
+    reason, spec = one.cell.extra().reason, one.spec
+    return reason.common_cause == cause and spec.backoff is None and spec.restarts(reason)
 
 
 def listed_at(cell: Cell) -> dict[str, Child] | None:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from ...actors.errors import HoldfastError, StartFailed, StartIgnored
 from ...actors.events import ActorStarted, Recovered, RecoveryFailed
-from ...actors.exit_reasons import KILLED, ExitReason, Hung, crash
+from ...actors.exit_reasons import ExitReason, Hung, crash
 from ...actors.kernel import links
 from ...actors.kernel.address_host import Work
 from ...actors.kernel.cell import RUNNING, Cell, TurnRest
@@ -338,7 +338,7 @@ class JournalHome(RecordedHome):
         """Keep everything, and count deaths in the same turn."""
         if worker is None or cell.state is not RUNNING:
             return None
-        running, noticed, ordered = self.in_hand(worker), worker.end.noticed_at, reason == KILLED
+        running, noticed, ordered = self.in_hand(worker), worker.end.noticed_at, reason.blames_nobody
 
         def over(recovers: bool | None) -> None:
             self.over(

@@ -456,17 +456,21 @@ class GroupPlace(Place):
 
     def has_fallen(self, group: Group, why: str) -> None:
         """No replica is left that could lead: the life is over, and whose fault it was may be known."""
-        cell, replicas, delivery = group.replicas.cell, group.replicas, group.delivery
+        cell, delivery = group.replicas.cell, group.delivery
         if cell.host.place is not self:
             return  # It has never been its life: another one goes on.
         self._careful = set() if delivery.out is None else {one.feed.id for one in delivery.out.requests}
         if self._starting is not None and not self._starting.done() and not delivery.is_live:
             self._fail(group, why)
             return
-        cells = [replicas.cell_of(name) for name in group.membership.names]
-        ends = [None if one is None or one.more is None else one.more.reason for one in cells]
-        faults = [reason for reason in ends if reason is not None and not reason.is_clean]
-        self._begin_end(cell, faults[-1] if faults else ends[0] or KILLED, delivery.only_suspect_input())
+        ends = self._ends(group)
+        faults = [reason for reason in ends if not reason.is_clean]
+        self._begin_end(cell, [KILLED, *ends[:1], *faults][-1], delivery.only_suspect_input())
+
+    def _ends(self, group: Group) -> list[ExitReason]:
+        """How the replicas have ended last, in their order."""
+        cells = [group.replicas.cell_of(name) for name in group.membership.names]
+        return [one.more.reason for one in cells if one is not None and one.more is not None]
 
     def _parts_ended(self, group: Group) -> None:
         """The mechanism's supervisor has given up."""
@@ -554,12 +558,13 @@ class GroupPlace(Place):
     ) -> None:
         """End all replicas, then the life at the address."""
         noticed, copy = time.monotonic(), None if self.group is None else self.group.copies.newest
+        ends = [] if self.group is None else self._ends(self.group)
         await self.dismantle(cell)
         self._ending = None
         if cell.state is not RUNNING:
             return
         if failed is not None:
-            reason = KILLED
+            reason = next((end for end in ends if end.common_cause), KILLED)
         if not ordered:
             if isinstance(self.home, TransientHome):
                 self.home.copy = copy

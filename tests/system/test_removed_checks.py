@@ -18,6 +18,7 @@ BOUNDED = "tests/migration/test_bounded_moves.py"
 AWAITED = "tests/supervision/test_awaited.py"
 CERTIFIED = "tests/system/test_moved_certificates.py"
 AT_ODDS = "tests/migration/test_moves_at_odds.py"
+FORK_SERVER = "tests/actors/process/test_fork_server_died.py"
 SUPERVISORS = "tests/migration/test_moved_supervisors.py"
 KINDS = "tests/migration/test_moved_kinds.py"
 JOURNALS = "tests/supervision/test_dynamic_journal.py"
@@ -884,6 +885,62 @@ CHECKS = {
         "        self.gate.readdressed(old, self.home)\n",
         REPLICAS,
         "test_what_a_replica_says",
+    ),
+    "the ends of many children by one cause are one restart": Check(
+        "supervision/supervisor.py",
+        "        if not self._causes.is_counted(reason.common_cause, one.spec.id, now, period):\n",
+        "        if True:\n",
+        FORK_SERVER,
+        "test_many_children",
+    ),
+    "the restart that one cause leads to begins with the first child that it has struck": Check(
+        "supervision/supervisor.py",
+        "order.index(self._first_struck(one, reason))",
+        "order.index(one)",
+        FORK_SERVER,
+        "test_a_group_is_restarted_once",
+    ),
+    "all that have ended with their fork server are told of at once": Check(
+        "actors/process/worker_pool.py",
+        "        if self.end.orphaned is not None:\n            self._workers",
+        "        if False:\n            self._workers",
+        FORK_SERVER,
+        "test_a_group_is_restarted_once",
+    ),
+    "a process whose socket another one has is told of with the others all the same": Check(
+        "actors/process/worker_pool.py",
+        "        if late or all(",
+        "        if all(",
+        FORK_SERVER,
+        "test_a_stray",
+    ),
+    "a supervisor gives up because of what its children have ended by": Check(
+        "supervision/supervisor.py",
+        "Shutdown(why, reason.common_cause)",
+        "Shutdown(why)",
+        FORK_SERVER,
+        "test_supervisors_that_give_up",
+    ),
+    "starts that fail by one cause are one restart": Check(
+        "supervision/supervisor.py",
+        "other.lost_by or crash(error)",
+        "crash(error)",
+        FORK_SERVER,
+        "test_starts_that_fail",
+    ),
+    "the message in its turn has no part in the end of the fork server": Check(
+        "actors/exit_reasons.py",
+        "        return bool(self.common_cause)\n",
+        "        return False\n",
+        FORK_SERVER,
+        "test_the_message_in_its_turn",
+    ),
+    "a child that ends once more by the same cause counts once more": Check(
+        "supervision/intensity.py",
+        "        is_new = cause not in self._counted or child in children\n",
+        "        is_new = cause not in self._counted\n",
+        "tests/supervision/test_intensity.py",
+        "test_a_common_cause",
     ),
     "two looks at threads are alike": Check(
         "testing/threads.py",
