@@ -125,10 +125,10 @@ CHECKS = {
     ),
     "who has its address is still bound when its life begins": Check(
         "supervision/supervisor.py",
-        "state is not GONE and not one.comes:",
-        "state is not GONE:",
-        EXPECTED,
-        "in_the_next_program and plain-bound",
+        "            bind_expected(self.ctx._cell, one, cell)\n",
+        "            pass\n",
+        BOUND,
+        "in_the_next_program and other",
     ),
     "what is said to a recorded address before its life is recorded": Check(
         "checkpoint/home/journal_home.py",
@@ -986,7 +986,7 @@ CHECKS = {
     ),
     "nobody waits for whom a transaction has bound it to": Check(
         "supervision/awaited.py",
-        "            if port in one.spec.late or lives(node, path):\n",
+        "            if port in one.spec.late or lives(node, self._listed, path):\n",
         "            if node.find(path) is not None:\n",
         KEPT,
         "test_a_binding_that_a_transaction_has_made_outlives_the_supervisor and last and task",
