@@ -278,6 +278,8 @@ class RegistryActor(Actor):
     def _note(self, holder: Cell) -> None:
         """Keep what a recorded actor holds: it is its own, as its state is, until it gives it up or is erased."""
         node, holdings = self.ctx._cell.node, self._book.holders.get(holder)
+        if not node.ports.keeper.has_recorded(holder.path):
+            return  # It is of another system, or a replica.
         entries = () if holdings is None else holdings.entries
         kept = [KeptKey(entry.key, entry.value) for entry in entries if entry.life == 0]
         try:
@@ -301,9 +303,10 @@ class RegistryActor(Actor):
 
     def _take_back(self, path: str) -> None:
         node = self.ctx._cell.node
-        body, holder = node.ports.keeper.noted(entries_key(path, self.ctx.path)), node.find(path)
+        body = node.ports.keeper.noted(entries_key(path, self.ctx.path))
         if body is None:
             return
+        holder = node.find(path)
         if holder is None or holder.has_nobody:
             self._await(path)
             return
@@ -366,9 +369,7 @@ class RegistryActor(Actor):
         if not entries:
             del self._book.keys[entry.key]
         del self._book.holders[entry.holder].entries[entry]
-        if entry.life == 0 and ended:
-            self._await(entry.holder.path)
-        elif entry.life == 0:
+        if entry.life == 0 and not ended:
             self._note(entry.holder)
         self._let_go(entry.holder)
         self._tell_listeners(KeyFreed(self.ctx.ref, key_of(entry.key), entry.holder.ref, ended))
