@@ -197,7 +197,7 @@ CHECKS = {
         "Backoff(initial=0.01, maximum=0.8, reset_after=1.0)",
         "Backoff(initial=0.01, maximum=2.0, reset_after=5.0)",
         "tests/ftm/test_many_losses.py",
-        "pbr-1.3",
+        "test_a_replica_that_is_lost_at_a_steady_rate",
     ),
     "who was never protected has not lost it": Check(
         "ftm/bricks/standing.py",

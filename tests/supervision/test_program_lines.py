@@ -152,8 +152,8 @@ async def test_a_receiver_that_is_bound_to_the_program_hears_its_first_lines(
 
 async def test_so_they_are_below_a_supervisor_in_a_process(system: hf.ActorSystem) -> None:
     lidar = sh("for n in 1 2 3 4 5; do echo $n; done; exec sleep 99", lines_to="/app/listener")
-    await system.start(hf.supervisor("far", isolation="process", children=[lidar]))
     with system.events() as events:
+        await system.start(hf.supervisor("far", isolation="process", children=[lidar]))
         await printed(events, "5")
         listener: hf.ActorRef[Listener] = await system.start(hf.child("listener", hf.start(Listener)))
         assert await heard(listener, 5) == [*"12345"]
