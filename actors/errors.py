@@ -406,6 +406,8 @@ class StartFailed(HoldfastError, text="{actor} could not be started: {reason}"):
     actor: str
     reason: str
 
+    struck_by = ""  # the common cause by which the life that was begun has ended, known in this process only
+
     def __init__(self, actor: str, reason: str = "") -> None:
         super().__init__(actor, reason.removeprefix(f"{actor} could not be started: "))  # Said once is enough.
 

@@ -98,6 +98,10 @@ class Crash(ExitReason, frozen=True, eq=False):
         """The traceback of the exception, formatted when it is asked for."""
         return self.formatted if self.error is None else format_error(self.error)
 
+    @property
+    def common_cause(self) -> str:
+        return self.error.struck_by if isinstance(self.error, StartFailed) else ""
+
     def __str__(self) -> str:
         if self.type_name == START_FAILED and self.text:
             return self.text  # It says who could not be started, and why: once for each level is enough.
@@ -196,6 +200,7 @@ def start_failed(actor: str, reason: ExitReason) -> StartFailed:
     """The error of a start that ended for `reason`; its cause is what was raised, if that was in this process."""
     failed = StartFailed(actor, str(reason))
     failed.__cause__ = reason.error if isinstance(reason, Crash) else None
+    failed.struck_by = reason.common_cause
     return failed
 
 

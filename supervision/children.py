@@ -39,7 +39,6 @@ class Child:
     restarts: tuple[float, ...] = ()  # its own recent ones, in seconds of the loop's clock without those in `away`
     away: float = 0.0  # seconds that its restarts have taken so far
     up_since: float = 0.0
-    lost_by: ExitReason | None = None  # the common cause by which its last start has failed, if it had one
     due: ExitReason | None = None  # why it is restarted, if it waits for that; None: it does not wait
     hurried: int = 0  # for which move of its supervisor it did not wait to the end
     retry: int = 0  # the number of the retry that counts; stale ones are dropped

@@ -346,11 +346,10 @@ class Supervisor(Inquiries):
         one.up_since = self.ctx._cell.node.loop.time()
 
     def _start_failed(self, one: Child, error: HoldfastError) -> None:
-        one.state, one.row, one.lost_by = STOPPED, None, None
+        one.state, one.row = STOPPED, None
         if one.cell is not None:
-            last = one.cell.extra().reason
-            if one.cell.life > one.ignored_life and last.common_cause:
-                one.lost_by = last  # The life that was begun has ended, and not by its own fault.
+            if one.cell.life > one.ignored_life and isinstance(error, StartFailed):  # A life was begun, and has ended.
+                error.struck_by = error.struck_by or one.cell.extra().reason.common_cause
             one.ignored_life = one.cell.life
         node = self.ctx._cell.node
         if node.events.has_listeners:
@@ -583,9 +582,7 @@ class Supervisor(Inquiries):
                 await self._come_up_in(row, other)
             except HoldfastError as error:
                 row.leave()
-                self._again(
-                    other, other.lost_by or crash(error)
-                )  # The others stay up, or are stopped, until it is tried again.
+                self._again(other, crash(error))  # The others stay up, or are stopped, until it is tried again.
 
     def _again(self, one: Child, reason: ExitReason) -> None:
         """A start has failed: try once more, which counts, unless only other code can help."""

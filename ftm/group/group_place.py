@@ -17,7 +17,7 @@ import msgspec
 
 from ...actors.backoff import Backoff
 from ...actors.errors import HoldfastError, StartFailed
-from ...actors.exit_reasons import KILLED, ExitReason, pack_exit, unpack_exit
+from ...actors.exit_reasons import KILLED, ExitReason, crash, pack_exit, unpack_exit
 from ...actors.kernel import lifecycle
 from ...actors.kernel.actor import Start
 from ...actors.kernel.address_host import AddressHost, Parent, Place
@@ -564,7 +564,7 @@ class GroupPlace(Place):
         if cell.state is not RUNNING:
             return
         if failed is not None:
-            reason = next((end for end in ends if end.common_cause), KILLED)
+            reason = next((end for end in (*ends, crash(failed)) if end.common_cause), KILLED)
         if not ordered:
             if isinstance(self.home, TransientHome):
                 self.home.copy = copy

@@ -923,10 +923,17 @@ CHECKS = {
     ),
     "starts that fail by one cause are one restart": Check(
         "supervision/supervisor.py",
-        "other.lost_by or crash(error)",
-        "crash(error)",
+        "error.struck_by or one.cell.extra().reason.common_cause",
+        "error.struck_by",
         FORK_SERVER,
         "test_starts_that_fail",
+    ),
+    "a protected actor that could not be started has ended by what its replicas have": Check(
+        "ftm/group/group_place.py",
+        "next((end for end in (*ends, crash(failed)) if end.common_cause), KILLED)",
+        "KILLED",
+        FORK_SERVER,
+        "test_protected_actors",
     ),
     "the message in its turn has no part in the end of the fork server": Check(
         "actors/exit_reasons.py",

@@ -82,27 +82,29 @@ class Tally(hf.Message[int]):
 class Taken(hf.Message[list[int]]): ...
 
 
-class Tallying(hf.Actor):
-    """Keeps all numbers that it has been told or asked."""
+class Keeping(hf.Actor):
+    """Keeps all numbers that it has been asked."""
 
     def __init__(self) -> None:
         self.numbers: list[int] = []
-
-    @hf.on(Tally)
-    def tally(self, message: Tally) -> int:
-        self.numbers.append(message.number)
-        return len(self.numbers)
 
     @hf.on(Taken, readonly=True)
     def taken(self, message: Taken) -> list[int]:
         return self.numbers
 
 
+class Tallying(Keeping):
+    @hf.on(Tally)
+    def tally(self, message: Tally) -> int:
+        self.numbers.append(message.number)
+        return len(self.numbers)
+
+
 def double(number: int) -> int:
     return 2 * number
 
 
-class Effecting(Tallying):
+class Effecting(Keeping):
     """Has a part of each turn done by a process for effects."""
 
     @hf.on(Tally)

@@ -11,6 +11,7 @@ import os
 import random
 import signal
 from collections import Counter
+from typing import Any
 
 import holdfast as hf
 from holdfast.actors.events import ChildRestarted, MessageQuarantined, SupervisorGaveUp
@@ -64,7 +65,7 @@ async def test_nothing_is_lost_and_nobody_gives_up() -> None:
     draw, load = random.Random(SEED), Load()
     method = hf.hybrid()
     async with hf.ActorSystem("app", log=False, period=PERIOD) as system:
-        refs = [
+        refs: list[hf.ActorRef[Any]] = [
             await system.start(hf.child(f"a{n}", hf.start(Tallying), isolation="process", recovery=method))
             for n in range(ACTORS)
         ]

@@ -124,6 +124,28 @@ async def test_starts_that_fail_by_a_second_death_count_once(tmp_path: Path) -> 
         assert await lives(system, "/app/group") == [3] * MANY
 
 
+async def test_protected_actors_whose_start_fails_by_a_second_death_count_once() -> None:
+    """Their replicas have processes, and nobody could take over yet."""
+    async with hf.ActorSystem("app", log=False) as system:
+        groups = [
+            hf.child(f"c{n}", hf.start(Counter), mechanism=hf.ftm.PBR(), recovery=hf.hybrid()) for n in range(MANY)
+        ]
+        await system.start(hf.supervisor("group", children=groups, intensity=2, period=600.0))
+        workers = system._workers
+        first = workers._server
+        assert first is not None
+        with system.events() as events:
+            os.kill(first.pid, signal.SIGKILL)
+            await next_event(events, ChildRestarted)
+            await until(lambda: sum("/ftm/" in home for home in workers.pids.values()) >= MANY)
+            second = workers._server
+            assert second is not None
+            os.kill(second.pid, signal.SIGKILL)
+            for n in range(MANY):
+                await system.ref(f"/app/group/c{n}", hf.Actor).ask(Add(), timeout=60.0)
+            assert not [event for event in events.take() if isinstance(event, SupervisorGaveUp)]
+
+
 @pytest.mark.parametrize("place", ["of its own", "of its supervisor"])
 async def test_the_message_in_its_turn_is_not_blamed(tmp_path: Path, place: str) -> None:
     begun, gate = tmp_path / "begun", tmp_path / "gate"
