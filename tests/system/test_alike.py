@@ -1,4 +1,4 @@
-"""What an actor may do is the same for each kind of actor: each public name of `ctx` and of the handles that it gives."""
+"""An actor may do the same whatever kind it is of: each public name of `ctx`, and of the handles that it gives."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ class Given(hf.Message[str]):
 
 class Typed(hf.Message[str]):
     handle: hf.ReplyHandle[str] | None = None
-    handles: list[hf.ReplyHandle[str]] = []
+    handles: tuple[hf.ReplyHandle[str], ...] = ()
 
 
 class Ask(hf.Message[Any]):
@@ -104,7 +104,7 @@ class Sender(hf.Actor):
             case "typed":
                 self.receiver.tell(Typed(value))
             case "typed inside":
-                self.receiver.tell(Typed(None, [value]))
+                self.receiver.tell(Typed(None, (value,)))
             case "effect":
                 await self.ctx.effect(length, value, isolation="process")
             case "pipe":
