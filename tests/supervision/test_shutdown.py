@@ -294,6 +294,6 @@ async def test_who_asks_below_a_supervisor_that_gives_up_is_told_why(kind: str, 
         waits = [asked.ask(Work(3.0), timeout=60.0)] if who != "crashed" else []
         crashed.tell(Boom())
         waits.append(asked.ask(Work(), timeout=60.0))
-        with pytest.raises(hf.ActorStopped, match="its parent has stopped: .*team/crashed: .*boom"):
+        with pytest.raises(hf.ActorStopped, match=r"its parent has stopped: .*team/crashed: .*boom"):
             await waits[-1]
         await asyncio.gather(*waits, return_exceptions=True)
