@@ -178,7 +178,7 @@ async def test_the_message_of_a_timer_that_was_put_aside_outlives_a_crash(place:
         _, door = await started(system, place)
         await door.send(Begin("tell_after"))
         await until_waiting(door, 1)
-        system.kill(door)
+        door.kill()
         await until_waiting(door, 1)  # The plain one begins anew, and puts it aside once more.
         await door.send(Open())
         assert (await door.ask(Seen()))[0] == ["tell_after"]
