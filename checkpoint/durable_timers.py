@@ -64,7 +64,7 @@ class Timers:
         One that ran then, and does not run now, was cancelled or has come in a turn that is handled again.
         """
         wanted = self._same.get(out.to, out.to)
-        if wanted != out.to or wanted in self._states or wanted in self._made:
+        if out.to in self._same or wanted in self._states or wanted in self._made:
             self.claimed.add(wanted)
             return False
         clock = (out.name, out.body, out.interval)
