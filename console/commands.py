@@ -13,6 +13,7 @@ from .. import HoldfastError, run
 from . import mechanism_commands, upgrade_commands
 from .nats_commands import nats
 from .operate import (
+    asking,
     changing,
     connecting,
     declaring,
@@ -102,6 +103,8 @@ for command in (
     looking.inspect,
     following.trace,
     following.logs,
+    asking.ask,
+    asking.tell,
     changing.suspend,
     changing.resume,
     changing.restart,
