@@ -13,7 +13,6 @@ from .. import HoldfastError, run
 from . import mechanism_commands, upgrade_commands
 from .nats_commands import nats
 from .operate import (
-    asking,
     changing,
     connecting,
     declaring,
@@ -25,6 +24,7 @@ from .operate import (
     repairing,
     retrying,
     showing,
+    speaking,
 )
 from .service import doctor, project, service_run
 from .store_commands import store
@@ -103,8 +103,8 @@ for command in (
     looking.inspect,
     following.trace,
     following.logs,
-    asking.ask,
-    asking.tell,
+    speaking.ask,
+    speaking.tell,
     changing.suspend,
     changing.resume,
     changing.restart,
