@@ -54,6 +54,7 @@ from .wire import (
     Overview,
     RepairVerb,
     RestartActor,
+    SendMessage,
     SettleQuarantined,
     Transact,
     Tree,
@@ -496,6 +497,16 @@ class RemoteSystem:
         """
         ended: str = await self.call(RestartActor(text_of(target), timeout, at_once), timeout)
         return ended
+
+    async def send_message(
+        self, path: str, message: str, fields: str, *, asks: bool, timeout: float = 5.0
+    ) -> dict[str, Any]:
+        """Send a message of a class that the actor handles, with its fields as JSON.
+
+        Returns the reply as plain data (`reply`), or as Python writes it (`text`); nothing of either if none is wanted.
+        """
+        said: dict[str, Any] = await self.call(SendMessage(path, message, fields, asks, timeout), timeout)
+        return said
 
     async def terminate(self, target: RemoteTarget, *, timeout: float = 5.0) -> str:
         """End a life in good order; its supervisor then does as its spec says. Returns its exit reason in words."""

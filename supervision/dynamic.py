@@ -331,7 +331,7 @@ async def stop_together(cells: list[Cell]) -> None:
     for cell in cells:
         spec: ChildSpec | None = cell.spec
         if cell.state in (DOWN, GONE):
-            lifecycle.retire(cell, "its parent has stopped")
+            lifecycle.retire_with_parent(cell)
             continue
         waiting.append((cell, lifecycle.stop_and_wait(cell) if spec is None else spec.begin_stop(cell)))
         patience = lifecycle.PATIENCE if spec is None else spec.shutdown
@@ -346,7 +346,7 @@ async def stop_together(cells: list[Cell]) -> None:
                 cell.spec.judge(cell, SHUTDOWN, ended)
             if above is not None:
                 tell_ended_with(cell, above.path)
-            lifecycle.retire(cell, "its parent has stopped")
+            lifecycle.retire_with_parent(cell)
     finally:
         for timer in timers:
             timer.cancel()

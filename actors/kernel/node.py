@@ -322,12 +322,12 @@ class Node(RunLoop):
     async def stop_child(self, cell: Cell) -> ExitReason:
         """Stop a child in good order, as its parent ends: by its spec, if it has one."""
         if cell.state is DOWN or cell.state is GONE:
-            lifecycle.retire(cell, "its parent has stopped")
+            lifecycle.retire_with_parent(cell)
             return cell.extra().reason
         parent = cell.parent
         reason: ExitReason = await (lifecycle.stop_in_time(cell) if cell.spec is None else cell.spec.stop(cell))
         if cell.parent is parent:  # Else it has another one now, and lives on.
-            lifecycle.retire(cell, "its parent has stopped")
+            lifecycle.retire_with_parent(cell)
         return reason
 
     def find(self, path: str) -> Cell | None:

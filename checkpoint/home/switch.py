@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import asyncio
 import functools
+import math
 from threading import get_ident
 from typing import TYPE_CHECKING, Any
 
@@ -370,7 +371,8 @@ class Switch:
         gone, begun = self.ledger.ended_in_the_stash(), -1 if first is not None else self.ledger.begun
         ledger, own = self.ledger, self.ledger.own_end
         timers = self.timers.after(ledger.turn)
-        port.to_life(Go(recovered, ledger.turn, gone, timers, begun, own.wanted, own.past))
+        spent = self.replay.spent_before(math.inf)
+        port.to_life(Go(recovered, ledger.turn, gone, timers, begun, own.wanted, own.past, spent))
 
     def let_at(self) -> None:
         """Let the actor at what is new, if nobody else has a say in that."""

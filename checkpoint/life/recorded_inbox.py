@@ -210,7 +210,10 @@ class GoLive(Hook):
     def run(actor: Any, item: Any) -> object:
         # Turns that failed are not replayed, but their numbers are used.
         item.life.turn = max(item.life.turn, item.go.turn)
-        item.life.timers.running = dict(item.go.timers)
+        timers = item.life.timers
+        for key in item.go.spent:
+            timers.came(key)
+        timers.running = dict(item.go.timers or timers.active)
         if item.go.recovered and type(actor).on_recovered is not Actor.on_recovered:
             item.life.hook_changes()
             return Hook.run(actor, item)

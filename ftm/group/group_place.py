@@ -409,10 +409,11 @@ class GroupPlace(Place):
                 pieces = [Restore(b"")]  # It begins afresh, but its turns are counted on.
             traps = traps or any(piece.traps for piece in pieces)
             variables = tuple(name for piece in pieces for name in piece.variables)
+            timers = {key: clock for piece in pieces for key, clock in piece.timers.items()}
             for index, piece in enumerate(pieces, 1):
                 is_last = index == len(pieces)
                 turn, stash = switch.ledger.state_turn, switch.ledger.stash
-                order = Install(known.epoch, turn, piece.data, stash, is_last, [], traps, variables)
+                order = Install(known.epoch, turn, piece.data, stash, is_last, [], traps, variables, timers)
                 await replicas.ask(first, order, LED_WITHIN)
             await replicas.ask(first, Lead(known.epoch, self.config), LED_WITHIN)
         except HoldfastError as error:

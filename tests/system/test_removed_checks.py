@@ -44,6 +44,10 @@ GLANCES = "tests/effects/test_glances_at_effects.py"
 TEXTS = "tests/system/test_texts.py"
 GRANTS = "tests/system/test_grants.py"
 HANGING = "tests/control/test_hanging_turn.py"
+ALIKE = "tests/system/test_alike.py"
+STASH = "tests/system/test_stash_everywhere.py"
+UNCODABLE = "tests/system/test_uncodable.py"
+SHUTDOWN = "tests/supervision/test_shutdown.py"
 
 CHECKS = {
     "who has given orders to others does not go into a process": Check(
@@ -87,6 +91,55 @@ CHECKS = {
         "                if False:",
         HANGING,
         "test_a_transaction_says_it_too and task-suspend",
+    ),
+    "a replay knows which timers have come in turns that are left out": Check(
+        "checkpoint/home/replay.py",
+        "        feed.spent = self.spent_before(number)\n",
+        "",
+        ALIKE,
+        "test_a_handle_says_in_each_life and replayed",
+    ),
+    "a life that has caught up knows it of the last ones": Check(
+        "checkpoint/home/switch.py",
+        "        spent = self.replay.spent_before(math.inf)\n",
+        "        spent = ()\n",
+        ALIKE,
+        "test_a_handle_says_in_each_life and recorded",
+    ),
+    "a replica that takes over knows which timers ran": Check(
+        "ftm/replica/actor_state.py",
+        "    life.timers.take(point.timers)\n",
+        "",
+        ALIKE,
+        "test_a_handle_says_in_each_life and protected",
+    ),
+    "what ends no turn of a message is not put aside": Check(
+        "checkpoint/life/recorded_context.py",
+        " or life.feed is None or fed.message is None:\n",
+        " or life.feed is None:\n",
+        STASH,
+        "test_what_is_no_message_is_not_put_aside and recorded",
+    ),
+    "a timer has no say in what was put aside": Check(
+        "checkpoint/durable_timers.py",
+        "return [source for source in ticks if source.id not in aside]",
+        "return ticks",
+        STASH,
+        "test_a_message_is_put_aside_however and every and recorded",
+    ),
+    "who sends a reply handle is told what to do instead": Check(
+        "actors/kernel/codec.py",
+        "    if isinstance(value, ReplyHandle):\n",
+        "    if False:\n",
+        UNCODABLE,
+        "test_no_message_takes_it_along and replayed",
+    ),
+    "who waits below a supervisor that gives up is told why": Check(
+        "actors/kernel/lifecycle.py",
+        "    cell.extra().reason = end.reason  # Those below it, which end with it, say why.\n",
+        "",
+        SHUTDOWN,
+        "gives_up_is_told_why",
     ),
     "who comes back waits for whom it is bound to": Check(
         "supervision/dynamic.py",
