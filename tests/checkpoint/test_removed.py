@@ -513,8 +513,8 @@ CHECKS = {
     ),
     "who has said that it ends does so in the next program": Check(
         "checkpoint/home/switch.py",
-        "begun, own.wanted, own.past))\n",
-        "begun, None, own.past))\n",
+        "begun, own.wanted, own.past, spent))\n",
+        "begun, None, own.past, spent))\n",
         "tests/checkpoint/test_restart_ends.py",
         "test_it_says_good_bye",
     ),
