@@ -156,9 +156,9 @@ class Feed(msgspec.Struct, array_like=True, tag=1, gc=False):
     """An input.
 
     `turn` is the number it had before the crash, -1 if it never ended; `pipes` have their result already; from
-    `deadline` on (on the loop's clock, 0: never) it is not begun any more; `origin` is the timer or the background
-    work that it comes from; `has_begun`: its turn has sent something, and has no end. `spent`: timers whose messages
-    came in turns before this one that are not handled again.
+    `deadline` on (on the loop's clock, 0: never) it is not begun any more, unless it `has_begun`, that is: its turn has
+    sent something, and has no end; `origin` is the timer or the background work that it comes from. `spent`: timers
+    whose messages came in turns before this one that are not handled again.
     """
 
     id: int

@@ -329,7 +329,7 @@ def _options(args: list[Any]) -> dict[str, Any]:
 
 def as_told(change: Change) -> dict[str, Any]:
     """The steps of a transaction, and how the tree changes, as plain data."""
-    steps = [(step.number, step.verb, step.target, step.text) for step in change.steps]
+    steps = [(step.number, step.verb, step.target, step.text, step.note) for step in change.steps]
     return {"steps": steps, "difference": list(change.difference), "lost": list(change.lost)}
 
 

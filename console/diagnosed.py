@@ -222,7 +222,8 @@ async def _seen(system: ActorSystem, address: str | None) -> str:
         return f"`{address}` is {status.state}{waits}"
     if status.turn is not None:
         where = f" at {status.turn_at}" if status.turn_at else ""
-        return f"`{address}` has been in one turn ({status.turn}{where}) for {status.turn_seconds:.1f} s{waits}"
+        rests = f"; it {status.turn_rests}" if status.turn_rests else ""
+        return f"`{address}` has been in one turn ({status.turn}{where}) for {status.turn_seconds:.1f} s{rests}{waits}"
     return f"`{address}` runs{waits}" if waits else ""
 
 

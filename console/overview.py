@@ -63,6 +63,8 @@ class ActorRow(msgspec.Struct, frozen=True, array_like=True):
     is_supervisor: bool
     allowed_bytes: int = 0
     """The memory that its own process may have; 0 if nothing bounds it."""
+    rests: bool = False
+    """Whether its turn rests, as it has said: in a sleep, a wait for a message, or an effect."""
 
 
 class ProcessUse(msgspec.Struct, frozen=True, array_like=True):
@@ -123,6 +125,13 @@ async def look_at(system: ActorSystem, *, parts: bool, paths: Iterable[str] | No
     pids = sorted({row.pid for row in rows if row.pid} | {os.getpid()})
     uses = [use for pid in pids if (use := process_use(pid)) is not None]
     return SystemLook(system.name, os.getpid(), time.monotonic(), rows, uses)
+
+
+async def silent_at_root(system: ActorSystem) -> list[str]:
+    """The children of the root for which no process answers."""
+    root = system._root
+    paths = [cell.path for cell in (root.children or {}).values()] if root is not None else []
+    return [row.path for row in (await look_at(system, parts=False, paths=paths)).rows if row.state == "silent"]
 
 
 def walk(top: Found, *, parts: bool) -> Iterator[Found]:
@@ -226,7 +235,7 @@ def row_of(one: Found) -> ActorRow:
     return ActorRow(
         one.path,
         type_name(kind) if kind is not None else "",
-        status.state if status is not None else child.state if child is not None else "stopped",
+        _state_of(status, child),
         "task" if spec is None else "replicas" if spec.mechanism is not None else spec.isolation,
         one.pid,
         max(0, status.life - 1) if status is not None else 0,
@@ -239,7 +248,14 @@ def row_of(one: Found) -> ActorRow:
         spec.restart if spec is not None else "",
         kind is not None and issubclass(kind, Supervisor),
         (spec.limits.memory_bytes or 0) if spec is not None and spec.limits is not None else 0,
+        status is not None and bool(status.turn_rests),
     )
+
+
+def _state_of(status: Status | None, child: Child | None) -> str:
+    if status is None or (child is not None and child.comes):
+        return child.state if child is not None else "stopped"
+    return status.state
 
 
 def names_of(cell: Cell | None) -> tuple[str, ...]:
@@ -268,6 +284,7 @@ def as_told(row: ActorRow, status: Status | None) -> ActorRow:
         queued=status.queued,
         turn=status.turn or "",
         turn_seconds=status.turn_seconds,
+        rests=bool(status.turn_rests),
     )
 
 

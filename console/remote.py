@@ -30,7 +30,7 @@ from ..system.history.evidence import PutAside
 from ..system.history.lives import PastLife
 from ..system.history.pages import MOST_ON_PAGE, HistoryPage, question
 from ..system.last_lines.line_page import LogPage, log_question
-from ..system.transaction.operation import Step
+from ..system.transaction.operation import Step, described_steps
 from .overview import LOOK, SystemLook
 from .wire import (
     RESPONSE,
@@ -706,8 +706,7 @@ class RemoteChange:
 
     def describe(self) -> str:
         """The steps, and how the tree changes, in words."""
-        lines = [f"{step.number}. {step.text}" for step in self.steps] or ["nothing to do"]
-        return "\n".join([*lines, *self._difference])
+        return "\n".join([*described_steps(self.steps), *self._difference])
 
 
 def text_of(target: RemoteTarget) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import functools
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -206,9 +207,9 @@ async def watch(
     mend = None
     if repair != "off":
         ways = _actions(reach, actions)
-        mend = repairer(
-            declaration, ways, policy, name=REPAIRER, addresses=where, stance=repair, approve=approve, file=repair_file
-        )
+        named: dict[str, Any] = {"name": REPAIRER, "addresses": where, "stance": repair, "approve": approve}
+        # In a thread: the parser of actions takes some tenths of a second, in which nobody else would have a turn.
+        mend = await asyncio.to_thread(repairer, declaration, ways, policy, file=repair_file, **named)
     started = await system.start(tree(History(declaration), watchers, name=name, repairer=mend, **options))
     return Watch(started, system._node, where, generated)
 

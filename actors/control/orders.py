@@ -36,6 +36,8 @@ class Order:
     """Base of all orders, which an actor obeys ahead of its messages."""
 
     verb: ClassVar[str]
+    is_beside: ClassVar[bool] = False
+    """Whether it is obeyed in the middle of a turn that waits, too."""
 
     def run(self, cell: Cell, actor: Actor) -> Any:
         """Carry it out; raises ControlFailed."""
@@ -361,6 +363,7 @@ class ObserveTurns(Order):
     """Count (`statistics`) and follow (`trace`) what the actor does, or do not any more; returns the counts."""
 
     verb: ClassVar[str] = "look"
+    is_beside: ClassVar[bool] = True
     counting: bool | None  # None: as it is
     tracing: bool | None
 
@@ -469,7 +472,7 @@ def status_of(cell: Cell) -> Status:
         os.getpid(),
         {} if more is None else {port: target.path for port, target in more.bindings.items()},
         "" if turn is None else waits_at(turn.coroutine),
-        "" if turn is None else rests_said(cell),
+        rests_said(cell),
     )
 
 
@@ -486,6 +489,12 @@ def rests_said(cell: Cell) -> str:
     """What the turn in hand waits for that is no other actor's work, in words; "" if none is known here."""
     now = cell.node.clock.wall()
     return " and ".join(rest.said(now) for rest in cell.host.rests(cell))
+
+
+def known_at_home(status: Status, cell: Cell) -> Status:
+    """A status with what the home of a recorded actor knows of its turn, and the process that it lives in does not."""
+    rests = rests_said(cell)
+    return dataclasses.replace(status, turn_rests=rests) if rests else status
 
 
 def _state(cell: Cell) -> str:

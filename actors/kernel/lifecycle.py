@@ -85,6 +85,8 @@ class HerePlace(Place):
             cell.node.loop.call_soon(_strike, cell, cell.life)
 
     def control(self, cell: Cell, call: QueuedOrder) -> None:
+        if call.runs_beside(cell):
+            return
         if call.is_urgent:
             urge(cell, call)
         else:

@@ -206,6 +206,13 @@ class Switch:
         """Whether senders wait until the next snapshot has cut the journal."""
         return self.limit.is_reached and not self.limit.makes_room() and self.method.snapshots
 
+    def takes_now(self, ask: Ask, out: Out, sender: str | None) -> bool:
+        """Whether an ask does not have to wait, and nothing is lost for it, whatever the policy."""
+        bound = self.intake.bound
+        if self.is_at_limit or (bound is not None and bound.is_full):
+            return False
+        return bound is None or bound.makes_room(ask, out.name, out.body, sender)
+
     @property
     def has_room(self) -> bool:
         """Whether a message would be taken now: the journal has room, and the mailbox."""
@@ -395,6 +402,8 @@ class Switch:
             bound.refill()
         self.due.on_want(self)
         self.ties.tie()
+        for come in self.node.awaited.pop(self.path, ()):
+            come()
         if holding is not None:
             holding.let_in()
 

@@ -607,4 +607,7 @@ def _in_background() -> bool:
 
 def once_more(feed: Feed) -> Feed:
     """The same input, to be handled in a turn of its own."""
-    return Feed(feed.id, -1, feed.kind, feed.name, feed.body, feed.time, feed.sender, feed.is_ask, feed.chain)
+    return Feed(
+        feed.id, -1, feed.kind, feed.name, feed.body, feed.time, feed.sender,
+        feed.is_ask, feed.chain, deadline=feed.deadline,
+    )  # fmt: skip

@@ -41,7 +41,7 @@ class Fed(Item, msgspec.Struct, eq=False):
         life: Life = item.life
         feed: Feed = item.feed
         life.open_turn(feed)
-        if feed.deadline and feed.turn < 0 and life.cell.node.clock.is_past(feed.deadline):
+        if feed.deadline and feed.turn < 0 and not feed.has_begun and life.cell.node.clock.is_past(feed.deadline):
             life.close_turn(DROPPED, NO_ANSWER)  # Nobody waits any more.
             return None
         if item.message is None and feed.name:

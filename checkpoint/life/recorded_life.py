@@ -546,6 +546,7 @@ class Life:
         stage = self.stage
         first = self.returned.pop(stage.begun, None)
         if first is not None:
+            first.feed.has_begun = True
             self.returned = {stage.begun: first} | self.returned
             stage.begun = -1
 

@@ -9,7 +9,7 @@ from typing import Any, Final
 import msgspec
 
 from ...system.history.evidence import LONG_TURN, seconds_text
-from ...system.history.why import MANY, MUCH
+from ...system.history.why import MANY, MUCH, NO_TROUBLE
 from ..overview import ActorRow
 
 NEWS: Final = 600.0
@@ -173,7 +173,7 @@ def suspects(seen: SeenSystem) -> list[str]:
 def _weight(seen: SeenSystem, row: ActorRow) -> float:
     if row.state == "silent":
         return 6.0
-    if row.turn and seen.now - row.turn_seconds >= LONG_TURN:
+    if row.turn and not row.rests and seen.now - row.turn_seconds >= LONG_TURN:
         return 4.0
     if row.state != "running":
         return 3.0
@@ -216,7 +216,7 @@ def seen_causes(seen: SeenSystem, path: str) -> list[tuple[str, str]]:
     seconds = seen.now - row.turn_seconds
     if row.state == "suspended":
         return [("suspended", f"{path} is suspended: it handles nothing, and {row.queued} messages wait.")]
-    if row.turn and seconds >= LONG_TURN:
+    if row.turn and not row.rests and seconds >= LONG_TURN:
         return [("its turn waits", f"{path} has been in the turn of {row.turn} for {seconds_text(seconds)}.")]
     if row.state == "stopped":
         return [("ended by others", f"{path} is stopped.")]
@@ -230,12 +230,14 @@ GRADES: Final = (ILL, ODD, NEWS_ONLY)
 
 def _is_own(one: tuple[str, str]) -> bool:
     cause, sentence = one
-    return cause not in OF_CHILDREN and (cause not in OF_ALL or sentence.startswith(OF_ITS_OWN))
+    return cause not in OF_CHILDREN | NO_TROUBLE and (cause not in OF_ALL or sentence.startswith(OF_ITS_OWN))
 
 
 def _is_told(seen: SeenSystem, path: str, one: tuple[str, str], told: set[str]) -> bool:
     """Whether a sentence stays: what concerns all is told of the root, and children that are asked speak themselves."""
     cause, sentence = one
+    if cause in NO_TROUBLE:
+        return False
     if cause == "trouble further below":
         return False  # Whoever it names is among those who are asked, or is silent: each stands in the list.
     if cause in OF_CHILDREN:

@@ -17,6 +17,7 @@ from ...actors.kernel.address_host import Work
 from ...actors.kernel.cell import Cell
 from ..kept_file import read_kept, write_kept
 from ..literals import ok, word_for
+from ..own_time import OwnTime
 from .hearing import Heard, listen
 from .observer import Manner, Observer
 
@@ -26,8 +27,12 @@ LONGER: Final = 4.0
 """Times the longest silence so far, after which a topic that should flow is silent for too long."""
 REGULAR: Final = 3.0
 """Times its mean silence, up to which one is in the rhythm of a topic that goes by a clock."""
-FORGIVEN: Final = 1000.0
+MOMENT: Final = 1.0
+"""Seconds of a silence that is out of rhythm by a moment only: such are soon forgiven."""
+FORGIVEN: Final = 20.0
 """Times the seconds of its silences out of rhythm, after which a topic goes by a clock all the same."""
+LONG_FORGIVEN: Final = 1000.0
+"""The same, of those that are longer than a moment."""
 BLOCK: Final = 50
 """Messages that come in, at least, over which those that go out are counted."""
 BLOCKS: Final = 6
@@ -52,6 +57,7 @@ class Usual(msgspec.Struct):
         least_out: the smallest part of what came in that went out, of all blocks; of two poor ones in a row neither.
         seconds: of all silences.
         odd_seconds: of those that were out of rhythm.
+        long_seconds: of those that were out of rhythm by more than a moment.
     """
 
     count: int = 0
@@ -62,12 +68,17 @@ class Usual(msgspec.Struct):
     least_out: float = 1.0
     seconds: float = 0.0
     odd_seconds: float = 0.0
+    long_seconds: float = 0.0
 
     @property
     def goes_by_clock(self) -> bool:
-        """Whether its silences are alike, but for a thousandth of the time at most: one hiccup wears off."""
-        odd_seconds = max(self.odd_seconds, self.longest_gap)  # Of an older file only the longest is known.
-        return self.longest_gap <= REGULAR * self.mean_gap or FORGIVEN * odd_seconds <= self.seconds
+        """Whether its silences are alike, but for hiccups: a twentieth of the time, of long ones a thousandth."""
+        if self.longest_gap <= REGULAR * self.mean_gap:
+            return True
+        # Of an older file only the longest is known.
+        odd_seconds = max(self.odd_seconds, self.longest_gap)
+        long_seconds = max(self.long_seconds, self.longest_gap if self.longest_gap > MOMENT else 0.0)
+        return FORGIVEN * odd_seconds <= self.seconds and LONG_FORGIVEN * long_seconds <= self.seconds
 
     def take(self, gap: float, came_in: int) -> None:
         """Learn of one more message."""
@@ -78,6 +89,7 @@ class Usual(msgspec.Struct):
         self.seconds += gap
         if gap > REGULAR * self.mean_gap:
             self.odd_seconds += gap
+            self.long_seconds += gap if gap > MOMENT else 0.0
 
     def take_block(self, part: float) -> None:
         """Learn of one more block of inputs, of which `part` has gone out."""
@@ -226,6 +238,13 @@ class FlowObserver(Observer):
         self._ears: set[str] = set()
         self._saved = 0.0
 
+    def on_start(self, restored: bool) -> None:
+        """Begin to look, and to keep the time in which the loop was not late: only that is anybody's silence."""
+        self._time = OwnTime(self.ctx._cell.node.loop)
+        if self.ctx._cell.node.clock.is_monotonic:  # Else it jumps from moment to moment, and is never late.
+            self.ctx.create_task(self._time.keep())
+        super().on_start(restored)
+
     @on(Heard)
     def _heard(self, message: Heard) -> Any:
         if message.sender is not None:
@@ -234,7 +253,7 @@ class FlowObserver(Observer):
 
     def hear(self, topic: str, message: Any) -> None:
         """Learn how long the topic was silent, and how much has come in meanwhile."""
-        self._arrived(topic, self.now)
+        self._arrived(topic, self._time.now())
 
     def _arrived(self, topic: str, now: float) -> None:
         flow = self._flows.get(topic)
@@ -256,7 +275,7 @@ class FlowObserver(Observer):
         """What came before somebody acted says nothing of after; other topics have nothing to do with it."""
         for topic, flow in self._flows.items():
             if word_for(topic) in names:
-                flow.begin(self.now)
+                flow.begin(self._time.now())
 
     async def look(self) -> None:
         """Listen to topics that are new, and say which flow."""
@@ -268,7 +287,7 @@ class FlowObserver(Observer):
             for gone in self._flows.keys() - self._made.keys():
                 del self._flows[gone]
             for new in self._made.keys() - self._flows.keys():
-                self._flows[new] = _Flow(self.now)
+                self._flows[new] = _Flow(self._time.now())
         self._users = {}
         for topic, made in self._made.items():
             for wanted in made.inputs:
@@ -296,7 +315,7 @@ class FlowObserver(Observer):
                 self._arrived(topic, when)
             self._arrivals.clear()
             for flow in self._flows.values():
-                flow.begin(self.now)
+                flow.begin(self._time.now())
 
     def _learned(self, topic: str) -> Usual:
         return self._baselines.of(topic, self.ctx._cell.node.clock.wall())
@@ -305,7 +324,7 @@ class FlowObserver(Observer):
         return [cell for path in made.publishers if (cell := self.ctx._cell.node.find(path)) is not None]
 
     def _flows_well(self, topic: str, made: FlowSource) -> bool | None:
-        flow, now = self._flows[topic], self.now
+        flow, now = self._flows[topic], self._time.now()
         learned = self._learned(topic)
         cells = self._publishers(made)
         works = [cell.host.work(cell) for cell in cells]

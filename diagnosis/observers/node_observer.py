@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from collections.abc import Awaitable, Mapping
 from typing import Final
 
-from ...actors.control.orders import Status, status_of
+from ...actors.control.orders import Status, known_at_home, status_of
 from ...actors.control.orders_lane import ask_status
 from ...actors.errors import HoldfastError, SpecError
 from ...actors.kernel.actor import Actor
@@ -31,8 +32,8 @@ class NodeObserver(Observer):
 
     Args:
         actors: component to address; it may change.
-        hung_after: seconds; an actor whose turn takes longer, or whose process does not answer so long, counts as not
-            running. None: nothing takes too long.
+        hung_after: seconds; an actor whose turn takes longer without a rest that it has told of, or whose process does
+            not answer so long, counts as not running. None: nothing takes too long.
         settling: seconds after somebody has started an actor again in which nothing that is seen of it, or of what
             depends on it, is held against it. One that is started more than three times in ten seconds gets none.
         manner: see `Observer`.
@@ -51,6 +52,7 @@ class NodeObserver(Observer):
         self._hung_after, self._settling = hung_after, settling
         self._lives: dict[Literal, tuple[Cell, int]] = {}
         self._starts: dict[Literal, tuple[float, ...]] = {}
+        self._rested: dict[str, float] = {}  # when an address was seen for the last time to rest in its turn
 
     def on_start(self, restored: bool) -> None:
         """Begin. Raises SpecError in a process of its own."""
@@ -99,19 +101,25 @@ class NodeObserver(Observer):
             return False
         worker = host.place.process(cell) if isinstance(host.place, WorkerPlace) else None
         if worker is None or self._hung_after is None:
-            return self._judged(status_of(cell))
+            return self._judged(status_of(cell), cell)
         return self._answers(worker, cell, self._hung_after)
 
     async def _answers(self, peer: Peer, cell: Cell, timeout: float) -> bool | None:
         try:
-            return self._judged(await ask_status(peer, cell, timeout))
+            return self._judged(await ask_status(peer, cell, timeout), cell)
         except HoldfastError:  # It has ended, or its process does not answer.
             return False
 
-    def _judged(self, status: Status) -> bool | None:
+    def _judged(self, told: Status, cell: Cell) -> bool | None:
+        status = known_at_home(told, cell)
         if status.state == "suspended":
             return None
-        return status.state == "running" and (self._hung_after is None or status.turn_seconds <= self._hung_after)
+        if status.turn_rests:
+            self._rested[cell.path] = self.now
+        elif status.turn is None:
+            self._rested.pop(cell.path, None)
+        at_work = min(status.turn_seconds, self.now - self._rested.get(cell.path, -math.inf))
+        return status.state == "running" and (self._hung_after is None or at_work <= self._hung_after)
 
 
 def at_root(observer: Actor) -> None:

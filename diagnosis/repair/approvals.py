@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import inspect
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Coroutine
+from typing import Any
 
 from .notices import ApprovalWanted, NobodyWaits
 
@@ -36,25 +37,31 @@ class Approvals:
             raise NobodyWaits(case)
         answer.set_result(why_not)
 
-    async def ask(self, wanted: ApprovalWanted, told: Callable[[ApprovalWanted], Awaitable[None]]) -> str | None:
+    async def ask(
+        self,
+        wanted: ApprovalWanted,
+        told: Callable[[ApprovalWanted], Awaitable[None]],
+        overtaken: Coroutine[Any, Any, None],
+    ) -> str | None:
         """Why a plan must not be carried out, empty if it may; None: nobody has answered in time.
 
         Args:
             wanted: what is asked, and for how long.
             told: tells it, when an answer can be taken already.
+            overtaken: returns when nobody need answer any more.
         """
         self._wanted, self._answer = wanted, asyncio.get_running_loop().create_future()
-        asked: asyncio.Task[None] | None = None
+        beside = [asyncio.create_task(overtaken)]
         try:
             await told(wanted)
             if self._approver is not None:
-                asked = asyncio.create_task(self._ask_program(self._approver, wanted, self._answer))
-            done, _ = await asyncio.wait((self._answer,), timeout=wanted.seconds)
-            return self._answer.result() if done else None
+                beside.append(asyncio.create_task(self._ask_program(self._approver, wanted, self._answer)))
+            await asyncio.wait((self._answer, beside[0]), timeout=wanted.seconds, return_when=asyncio.FIRST_COMPLETED)
+            return self._answer.result() if self._answer.done() else None
         finally:
             self._wanted = self._answer = None
-            if asked is not None:
-                asked.cancel()
+            for task in beside:
+                task.cancel()
 
     async def _ask_program(self, approver: Approver, wanted: ApprovalWanted, answer: asyncio.Future[str]) -> None:
         try:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 
-from ...actors.control.orders import Status, status_of
+from ...actors.control.orders import Status, known_at_home, status_of
 from ...actors.control.orders_lane import ask_status
 from ...actors.errors import HoldfastError
 from ...actors.kernel.node import Node
@@ -16,7 +16,7 @@ async def answers(node: Node, address: str, seconds: float) -> bool | None:
     """Whether an actor lives and gets on with its messages.
 
     Its mailbox is not used: a ping behind a thousand messages would say how long the queue is. A turn that is as old
-    as the wait is one that hangs.
+    as the wait is one that hangs, unless it rests as it has said.
 
     Args:
         node: where it is looked up.
@@ -35,7 +35,8 @@ async def answers(node: Node, address: str, seconds: float) -> bool | None:
     second = await looked_at(node, address, seconds)
     if second is None or second.state != "running":
         return None if second is not None and second.state == "suspended" else False
-    return second.life != first.life or second.turn is None or second.turn_seconds < seconds
+    rests = first.turn_rests or second.turn_rests
+    return second.life != first.life or second.turn is None or bool(rests) or second.turn_seconds < seconds
 
 
 async def looked_at(node: Node, address: str, seconds: float) -> Status | None:
@@ -50,7 +51,6 @@ async def looked_at(node: Node, address: str, seconds: float) -> Status | None:
     if peer is None:
         return status_of(cell)
     try:
-        seen: Status = await ask_status(peer, cell, seconds)
+        return known_at_home(await ask_status(peer, cell, seconds), cell)
     except HoldfastError:  # It has ended, or does not answer: both are the answer.
         return None
-    return seen

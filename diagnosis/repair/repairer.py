@@ -45,6 +45,7 @@ from .approvals import Approvals, Approver
 from .case import Case, Finishing, Verifying, Watching, base_of, reached
 from .choice import CaseView, choose, components_of, problem_for
 from .executor import DONE, SKIPPED, UNVERIFIED, Executor, Result
+from .harmless import harmless_part
 from .ledger import Ledger, Memory
 from .outlook import OURS, Outlook
 from .ping import answers, looked_at
@@ -395,6 +396,8 @@ class Repairer(Actor):
         outcome = await find_plan(self._planner, problem, timeout=policy.plan_seconds, degrade=True)
         if not isinstance(outcome, Plan) or not outcome.stages:
             return deciding.judge_no_plan(case, bad, outcome, at.mode, policy)
+        if self._memory.stance == "on":  # Of what is left the next round plans.
+            outcome = harmless_part(problem, outcome, self._is_dangerous, self._address)
         wait = self._ledger.wait(outcome.steps, dict(self._actions.actions), self.now())
         if wait > 0:
             return deciding.Wait(wait)
@@ -452,17 +455,15 @@ class Repairer(Actor):
 
     async def _approved_by(self, case: Case, bad: tuple[str, ...], plan: Plan) -> deciding.Decision | None:
         """Have a person approve, if that is needed; what follows if nobody does, None: go on."""
-        policy, actions = self._policy, self._actions
-        marked = {step: actions[step.action].is_dangerous for step in plan.steps}
-        dangerous = [step for step in plan.steps if policy.is_dangerous(step.action, marked[step])]
-        if self._memory.stance != "ask" and not dangerous:
+        policy = self._policy
+        if self._memory.stance != "ask" and not any(map(self._is_dangerous, plan.steps)):
             return None
         what = ", ".join(map(str, plan.steps))
         reason = f"{', '.join(bad)} {'is' if len(bad) == 1 else 'are'} diagnosed"
         wanted = say.ApprovalWanted(case.number, plan.steps, reason, policy.approval)
-        why = await self._approvals.ask(wanted, self._tell)
+        why = await self._approvals.ask(wanted, self._tell, self._others_blamed(case, bad))
         if why is None and self._chosen(case) != bad:
-            return deciding.Enter()  # Nobody was needed.
+            return deciding.Enter()  # Nobody was needed, or others need something first.
         if why is None:
             return deciding.GiveUp(bad, f"nobody has approved {what} within {policy.approval:g} s")
         if why:
@@ -470,6 +471,18 @@ class Repairer(Actor):
             self._ledger.deny(bad, why)
             return deciding.GiveUp(bad, f"{what} was not allowed: {why}")
         return None
+
+    def _is_dangerous(self, step: Step) -> bool:
+        return self._policy.is_dangerous(step.action, self._actions[step.action].is_dangerous)
+
+    async def _others_blamed(self, case: Case, bad: tuple[str, ...]) -> None:
+        """Return when another candidate is to be acted on, and the diagnosis has stood for a while."""
+        while True:
+            left = self._outlook.diagnosed + self._policy.settle - self.now()
+            is_same = self._chosen(case) in (None, bad)
+            if not is_same and left <= 0:
+                return
+            await self._sleep(math.inf if is_same else left, wakes=True)
 
     async def _take_back(self, case: Case) -> None:
         """If the plan has not helped, count it, and undo of it what can be undone, the newest first."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from collections import Counter, deque
 from collections.abc import Iterator
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
 
-from ...actors.control.orders import Status, rests_said, status_of
+from ...actors.control.orders import Status, status_of
 from ...actors.kernel.cell import GONE
 from ...actors.kernel.envelope import NO_DEADLINE, Ask, Item, message_in
 from ...actors.process.open_asks import items_at, open_asks
@@ -118,6 +117,7 @@ class ChildNow(msgspec.Struct, frozen=True):
         awaited: the address for which its start waits, because it is bound to it.
         queued: messages that wait for it.
         waited: seconds for which one of them has waited at least; 0 if that is not known.
+        rests: what its turn rests in, as it has said, while nobody waits for an answer of it; "" if it does not.
     """
 
     name: str
@@ -128,11 +128,17 @@ class ChildNow(msgspec.Struct, frozen=True):
     awaited: str = ""
     queued: int = 0
     waited: float = 0.0
+    rests: str = ""
+
+    @property
+    def is_long(self) -> bool:
+        """Whether its turn, or a message that waits for it, takes long enough for a sentence."""
+        return bool(self.turn and self.turn_seconds >= LONG_TURN) or self.waited >= LONG_TURN
 
     @property
     def is_slow(self) -> bool:
-        """Whether its turn, or a message that waits for it, takes long enough for a sentence."""
-        return bool(self.turn and self.turn_seconds >= LONG_TURN) or self.waited >= LONG_TURN
+        """Whether it takes long enough, and is not a rest."""
+        return self.is_long and not self.rests
 
 
 class ProcessMemory(msgspec.Struct, frozen=True):
@@ -151,6 +157,7 @@ class Waiting(msgspec.Struct, frozen=True):
         sender: one of their senders, or "".
         waited: seconds for which one of them has waited at least; 0 if that is not known.
         late: asks whose time is over, so that nobody waits for their answers any more.
+        asked: seconds for which an ask has waited at least; 0 if that is not known.
         mean_turn: seconds that a turn takes in the mean; 0 if statistics are off, or another process has them.
     """
 
@@ -160,6 +167,12 @@ class Waiting(msgspec.Struct, frozen=True):
     waited: float = 0.0
     late: int = 0
     mean_turn: float = 0.0
+    asked: float = 0.0
+
+    @property
+    def is_in_vain(self) -> bool:
+        """Whether somebody who has asked waits for long, or has given up."""
+        return self.asked >= LONG_TURN or self.late > 0
 
 
 class Below(msgspec.Struct, frozen=True):
@@ -249,6 +262,12 @@ class Evidence(msgspec.Struct, frozen=True):
     waiting: Waiting | None = None
     awaited: str = ""
 
+    @property
+    def rests(self) -> bool:
+        """Whether its turn rests, as it has said, and nobody waits for an answer meanwhile."""
+        is_asked = self.waiting is not None and self.waiting.is_in_vain
+        return bool(self.status and self.status.turn_rests) and not self.asks and not is_asked
+
     def ago(self, at: float) -> str:
         """A moment as people say it: how long ago, or the time of day if that is long."""
         seconds = self.now - at
@@ -310,7 +329,7 @@ def collect(
         answer(recorder, question(literal(address), limit=MOST)).events,
         sorted(ancestors, key=lambda event: event.number),
         answer(recorder, question(kinds=STORE_KINDS, limit=20)).events,
-        _known_at_home(told.status, cell),
+        told.status,
         told.queued_before,
         # All mailboxes are searched for them, and only of a turn that goes on is anything said of its asks.
         outstanding(node, address) if told.status is not None and told.status.turn is not None else [],
@@ -345,12 +364,6 @@ def _awaited(node: Node, address: str) -> str:
     return "" if one is None else one.awaited
 
 
-def _known_at_home(status: Status | None, cell: Cell | None) -> Status | None:
-    """A status with what the home of a recorded actor knows of its turn, and the process that it lives in does not."""
-    rests = "" if cell is None else rests_said(cell)
-    return dataclasses.replace(status, turn_rests=rests) if status is not None and rests else status
-
-
 def _children(node: Node, address: str, overview: dict[str, Any]) -> list[ChildNow]:
     """A supervisor's children, each with its turn if that can be seen from here."""
     return [
@@ -368,8 +381,12 @@ def _child_now(cell: Cell | None, name: str, about: dict[str, Any]) -> ChildNow:
 
 
 def _now(cell: Cell, status: Status, name: str, state: str, awaited: str = "") -> ChildNow:
-    waited = max((one.seconds for one in _queued(cell, FIRST)), default=0.0) if status.queued else 0.0
-    return ChildNow(name, state, status.turn or "", status.turn_seconds, status.turn_at, awaited, status.queued, waited)
+    found = list(_queued(cell, FIRST)) if status.queued else []
+    waited = max((one.seconds for one in found), default=0.0)
+    is_asked = any(one.is_ask and one.seconds >= LONG_TURN for one in found)
+    rests = "" if is_asked else status.turn_rests
+    turn, seconds, at = status.turn or "", status.turn_seconds, status.turn_at
+    return ChildNow(name, state, turn, seconds, at, awaited, status.queued, waited, rests)
 
 
 def _ended_below(recorder: HistoryRecorder, address: str, children: list[ChildNow]) -> dict[str, PastLife]:
@@ -417,7 +434,7 @@ def _deeper_now(cell: Cell) -> list[ChildNow]:
             continue
         status = status_of(one)
         now = _now(one, status, one.path, status.state)
-        if now.state == "suspended" or now.is_slow:
+        if now.state == "suspended" or now.is_long:
             found.append(now)
     return found
 
@@ -477,7 +494,8 @@ def _waiting(cell: Cell) -> Waiting | None:
     for name, count in counts.most_common(1):
         longest = max(one.seconds for one in found)
         late = sum(one.is_late for one in found)
-        return Waiting(name, count, senders.get(name, ""), longest, late, _mean_turn(cell))
+        asked = max((one.seconds for one in found if one.is_ask), default=0.0)
+        return Waiting(name, count, senders.get(name, ""), longest, late, _mean_turn(cell), asked)
     return None
 
 
@@ -488,6 +506,7 @@ class _Queued(NamedTuple):
     sender: str
     seconds: float
     is_late: bool
+    is_ask: bool
 
 
 def _queued(cell: Cell, most: int) -> Iterator[_Queued]:
@@ -497,14 +516,16 @@ def _queued(cell: Cell, most: int) -> Iterator[_Queued]:
         for item in items_at(cell, most):
             sender = item.sender.path if isinstance(item, Item) and item.sender is not None else ""
             is_late = isinstance(item, Ask) and item.is_done
-            yield _Queued(message_type(message_in(item)), sender, _waited(item, node.loop.time()), is_late)
+            seconds = _waited(item, node.loop.time())
+            yield _Queued(message_type(message_in(item)), sender, seconds, is_late, isinstance(item, Ask))
         return
     in_hand = cell.host.place.running(cell)
     for source in islice(switch.ledger.open.values(), most):
         if source.kind == MESSAGE and source.id != in_hand and not source.was_stashed:
             seconds = max(0.0, node.clock.wall() - source.time)
+            is_ask = source.ask is not None
             is_late = source.ask is not None and source.ask.is_done
-            yield _Queued(source.name.replace(":", "."), source.sender or "", seconds, is_late)
+            yield _Queued(source.name.replace(":", "."), source.sender or "", seconds, is_late, is_ask)
 
 
 def _waited(item: Any, now: float) -> float:

@@ -18,6 +18,7 @@ from .why_children import (
     ended_children,
     moving_children,
     overdue_children,
+    rest_below,
     restarts_of_children,
     troubled_children,
     waiting_children,
@@ -33,6 +34,11 @@ MUCH = 0.6
 ROUNDED = 1.0
 """Seconds by which the end of a supervisor may be told of later than its reason for it."""
 
+AT_REST = "its turn rests"
+REST_BELOW = "turns that rest below"
+NO_TROUBLE = frozenset({AT_REST, REST_BELOW})
+"""Causes of which there is something to tell, while nothing is wrong."""
+
 Rule = Callable[[Evidence], list[str]]
 
 
@@ -44,7 +50,7 @@ class Cause(NamedTuple):
 
 
 def causes(evidence: Evidence) -> list[Cause]:
-    """Say what is wrong at the address, a sentence for each thing, what weighs most first; nothing if all is well."""
+    """Say what is wrong at the address, a sentence for each thing, what weighs most first, and who rests last."""
     return [Cause(name, sentence) for name, rule in RULES.items() for sentence in rule(evidence)]
 
 
@@ -54,7 +60,9 @@ def why(evidence: Evidence) -> list[str]:
     >>> why(Evidence("/app/till", 0.0))
     ['Nobody lives at /app/till, and the history knows of no life there.']
     """
-    return [one.sentence for one in causes(evidence)] or [_well(evidence)]
+    found = causes(evidence)
+    is_well = all(one.cause == REST_BELOW for one in found)
+    return [*([_well(evidence)] if is_well else []), *(one.sentence for one in found)]
 
 
 def _well(evidence: Evidence) -> str:
@@ -156,6 +164,8 @@ def _fault(life: PastLife) -> str:
                 else ""
             )
             return f"its process was ended by {reason}{who}"
+        case "ForkServerDied":
+            return f"{reason}, as all others did: no fault of its own, and one restart for all of them"
         case "OutOfMemory":
             return f"its process was {reason}" if life.pid else reason
         case "Hung":
@@ -320,6 +330,15 @@ def _start_waits(evidence: Evidence) -> list[str]:
 
 def _waits(evidence: Evidence) -> list[str]:
     """Its turn waits for an answer, or for something else."""
+    return [] if evidence.rests else _long_turn(evidence)
+
+
+def _rests(evidence: Evidence) -> list[str]:
+    """Its turn rests, as it has said, and so do the messages that wait for it."""
+    return [*_long_turn(evidence), *_waiting_messages(evidence)] if evidence.rests else []
+
+
+def _long_turn(evidence: Evidence) -> list[str]:
     status = evidence.status
     if status is None or status.turn is None or status.turn_seconds < LONG_TURN:
         return []
@@ -349,6 +368,10 @@ def _silent(evidence: Evidence) -> list[str]:
 
 def _mailbox(evidence: Evidence) -> list[str]:
     """Many messages wait for it, or one has waited for long."""
+    return [] if evidence.rests else _waiting_messages(evidence)
+
+
+def _waiting_messages(evidence: Evidence) -> list[str]:
     status, before, waiting = evidence.status, evidence.queued_before, evidence.waiting
     if status is None or not status.queued or status.state == "suspended":
         return []
@@ -472,6 +495,8 @@ RULES: dict[str, Rule] = {
     "children that had to be killed": overdue_children,
     "children that wait": waiting_children,
     "trouble further below": deeper_trouble,
+    AT_REST: _rests,
+    REST_BELOW: rest_below,
     "events left out": _gap,
 }
 """The causes, in the order in which they are told."""

@@ -76,6 +76,13 @@ def waiting_children(evidence: Evidence) -> list[str]:
     return _first([f"Its child {one.name} does not get on{_hangs(one)}." for one in slow] + held)
 
 
+def rest_below(evidence: Evidence) -> list[str]:
+    """Which children, and who further below, are in a turn that rests as it has said: that is no trouble."""
+    said = [f"Its child {one.name} {_at_rest(one)}." for one in _in(evidence, "running") if _rests(one)]
+    said += [f"Below it, {one.name} {_at_rest(one)}." for one in evidence.deeper.now if _rests(one)]
+    return _first(said)
+
+
 def troubled_children(evidence: Evidence) -> list[str]:
     """Which children have something to tell that is no end: whoever asks about them hears more."""
     said = [
@@ -116,6 +123,8 @@ def _deeper_trouble(evidence: Evidence) -> dict[str, tuple[float, str]]:
             found[path] = weight, words
 
     for one in evidence.deeper.now:
+        if _rests(one):
+            continue
         held = one.state == "suspended"
         add(one.name, 1.0 if held else 2.0, "is suspended" if held else f"does not get on{_hangs(one)}")
     for event in evidence.deeper.events:
@@ -159,6 +168,16 @@ def _hangs(one: ChildNow) -> str:
     if one.waited >= LONG_TURN:
         said += f"; {messages_text(one.queued)} for it, one for {seconds_text(one.waited)} or more"
     return said
+
+
+def _rests(one: ChildNow) -> bool:
+    return one.state == "running" and one.is_long and bool(one.rests)
+
+
+def _at_rest(one: ChildNow) -> str:
+    """What a child's turn rests in, in the words of its own."""
+    turn = f"is in the turn of {one.turn}: it " if one.turn else ""
+    return f"{turn}{one.rests}"
 
 
 def _first(said: list[str]) -> list[str]:

@@ -17,6 +17,7 @@ FOLLOWING = "tests/diagnosis/live/test_following.py"
 BRIDGES = "tests/diagnosis/bridges/test_bridges.py"
 BOARD = "tests/diagnosis/board/test_board.py"
 FLOW = "tests/diagnosis/observers/test_flow.py"
+SILENT = "tests/diagnosis/live/test_silent_topics.py"
 FOREIGN = "tests/diagnosis/foreign/test_foreign.py"
 
 CIRCLES = "tests/diagnosis/observers/test_circles.py"
@@ -305,15 +306,43 @@ CHECKS = {
     ),
     "one hiccup does not blind what goes by a clock": Check(
         "diagnosis/observers/flow.py",
-        "return self.longest_gap <= REGULAR * self.mean_gap or FORGIVEN * odd_seconds <= self.seconds",
-        "return self.longest_gap <= REGULAR * self.mean_gap",
+        "return FORGIVEN * odd_seconds <= self.seconds and LONG_FORGIVEN * long_seconds <= self.seconds",
+        "return False",
         FLOW,
         "had_one_hiccup",
     ),
+    "a short hiccup of a quick topic is soon forgiven": Check(
+        "diagnosis/observers/flow.py",
+        "FORGIVEN: Final = 20.0",
+        "FORGIVEN: Final = 1000.0",
+        SILENT,
+        "falls_silent_is_seen and gap",
+    ),
+    "the time in which the loop was late is nobody's silence": Check(
+        "diagnosis/own_time.py",
+        "            self._late += max(0.0, self._loop.time() - self._due)\n",
+        "",
+        SILENT,
+        "loop_itself_was_late and uvloop",
+    ),
+    "who asks first behind that knows it, too": Check(
+        "diagnosis/own_time.py",
+        "return now - self._late - max(0.0, now - self._due)",
+        "return now - self._late",
+        SILENT,
+        "whoever_asks_first",
+    ),
+    "watch computes beside the loop": Check(
+        "diagnosis/system_watch.py",
+        "mend = await asyncio.to_thread(repairer, declaration",
+        "mend = repairer(declaration",
+        SILENT,
+        "watch_computes_beside_the_loop",
+    ),
     "what pauses again and again goes by no clock": Check(
         "diagnosis/observers/flow.py",
-        "return self.longest_gap <= REGULAR * self.mean_gap or FORGIVEN * odd_seconds <= self.seconds",
-        "return True",
+        " and LONG_FORGIVEN * long_seconds <= self.seconds",
+        "",
         FLOW,
         "bursts_never_go_by_a_clock",
     ),

@@ -18,7 +18,7 @@ from holdfast.system.history.evidence import (
     Silence,
     Waiting,
 )
-from holdfast.system.history.why import RULES, why
+from holdfast.system.history.why import RULES, causes, why
 
 AT = "/app/shop/till"
 NOW = 1_000.0
@@ -378,6 +378,16 @@ CASES: dict[str, tuple[dict[str, Any], str]] = {
         },
         f"Below it, {AT}/a/b was restarted 2 times within the last 40 s (KeyError: 8): ask why of {AT}/a/b.",
     ),
+    "a child that rests": (
+        {
+            "is_there": True,
+            "status": status(),
+            "below": Below(
+                now=[ChildNow("a", "running", "shop.Pay", 3.0, waited=2.0, queued=1, rests="has slept for 3.0 s")]
+            ),
+        },
+        "Its child a is in the turn of shop.Pay: it has slept for 3.0 s.",
+    ),
     "a child that is suspended": ({"below": Below(now=[ChildNow("a", "suspended")])}, "Its child a is suspended."),
     "little memory is left": (
         {"process": OwnProcess(ProcessMemory(250_000_000, 300_000_000))},
@@ -432,10 +442,15 @@ CASES: dict[str, tuple[dict[str, Any], str]] = {
 }
 
 
+def test_that_somebody_rests_is_told_though_nothing_is_wrong() -> None:
+    known, rests = CASES["a child that rests"]
+    assert why(evidence(known)) == [f"{AT} is running, in life 2, and nothing is wrong as far as is known.", rests]
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_each_cause_has_its_sentence(name: str) -> None:
     known, sentence = CASES[name]
-    said = why(evidence(known))
+    said = [one.sentence for one in causes(evidence(known))] or why(evidence(known))
     assert len(said) == 1
     assert said[0] == sentence or (sentence.endswith("1970-01-01") and said[0].startswith(sentence))
 

@@ -392,9 +392,18 @@ async def test_a_turn_that_rests_as_it_has_said(
     spec = hf.child("sleeper", hf.start(Sleeper), isolation=place, recovery=recovery, shutdown="brutal_kill")
     sleeper = await system.start(spec)
     sleeper.tell(Do(what))
+    sleeper.tell(Do("well"))
     await asyncio.sleep(1.3)
-    text = await said(system, sleeper)
+    text, above = await said(system, sleeper), await said(system, "/app")
     assert re.search(rf"/app/sleeper has been in the turn of tests.history.players.Do for 1\.\d s.*{says}", text), text
+    assert above.startswith("/app is running, in life 1, and nothing is wrong as far as is known."), above
+    if place == "task" or recovery is not None:  # Else only its process knows.
+        assert re.search(rf"Its child sleeper .*{says.removeprefix('; it ')}", above), above
+    late = sleeper.ask(Do("well"), 1.0)
+    with pytest.raises(hf.AskTimeout):
+        await late
+    if place == "task" or recovery is not None:
+        assert "Its child sleeper does not get on" in await said(system, "/app")
 
 
 async def test_suspended_and_full(system: hf.ActorSystem) -> None:

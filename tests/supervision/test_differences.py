@@ -12,7 +12,7 @@ import pytest
 
 import holdfast as hf
 from holdfast.testing import probe
-from tests.supervision.family import Boom, Family, Life, Plan, kid, refused
+from tests.supervision.family import Boom, Family, Leave, Life, Plan, kid, refused
 
 TEXT = (Path(__file__).parents[2] / "docs" / "differs-from-otp.md").read_text("utf-8")
 SLOW = hf.Backoff(initial=60.0, maximum=60.0, jitter=0.0)
@@ -156,6 +156,18 @@ async def slow_restarts_add_up(system: hf.ActorSystem) -> None:
     for _ in range(2):
         await family.after("a", Boom())
         await asyncio.sleep(1.0)  # It is up again by now.
+    assert not family.is_alive
+
+
+@entry("children that end by one common cause")
+async def one_cause_is_one_restart(system: hf.ActorSystem) -> None:
+    plan, cause = Plan(), hf.ForkServerDied(1, "SIGKILL")
+    family = await Family.start(system, plan, *(kid(plan, name) for name in "abc"), intensity=1, restart="temporary")
+    for name in "abc":
+        family.ref(name).tell(Leave(cause))
+    await family.rest()
+    assert (await family.states()) == {"a": "running", "b": "running", "c": "running"}
+    await family.after("a", Leave(cause))  # It would not end by the same cause for ever.
     assert not family.is_alive
 
 

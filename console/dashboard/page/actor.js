@@ -32,7 +32,7 @@ export function actorView(main, path, more) {
     const turn = row ? turnSeconds(row) : 0;
     const chip = (text, kind = "") => el("span", { class: `chip ${kind}` }, text);
     chips.replaceChildren(...(row ? [chip(row.state, gravity(row.state) || "well"), " ", el("span", { class: "faint" }, shortKind(row.kind)), " ",
-      turn >= 1 ? [chip(`in ${shortKind(row.turn)} for ${seconds(turn)}`, turn >= 5 ? "ill" : "odd"), " "] : null,
+      turn >= 1 ? [chip(`${row.rests ? "rests in" : "in"} ${shortKind(row.turn)} for ${seconds(turn)}`, row.rests ? "" : turn >= 5 ? "ill" : "odd"), " "] : null,
       row.restarts ? [chip(plural(row.restarts, "restart"), "odd"), " "] : null, row.mechanism.length ? chip(row.mechanism.join(" + ")) : null].flat().filter(Boolean) : [chip("not there now", "odd")]));
     const verbs = !row ? [] : row.state === "stopped" ? ["start", "remove"] : [row.state === "suspended" ? "resume" : "suspend", "restart", "kill", "stop", "checkpoint", "remove"];
     const usable = verbs.filter((verb) => aboveOf(path) || ["suspend", "resume"].includes(verb)).filter((verb) => verb !== "checkpoint" || row.recovery);

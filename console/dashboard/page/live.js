@@ -3,7 +3,7 @@
 import { stream, watch, whoAmI } from "./server.js";
 import { aboveOf, nameOf } from "./dom.js";
 
-const FIELDS = ["path", "kind", "state", "place", "pid", "restarts", "queued", "turn", "since", "recovery", "mechanism", "names", "restart", "isSupervisor", "allowed"];
+const FIELDS = ["path", "kind", "state", "place", "pid", "restarts", "queued", "turn", "since", "recovery", "mechanism", "names", "restart", "isSupervisor", "allowed", "rests"];
 const KEPT_EVENTS = 500, KEPT_POINTS = 300;
 
 export const live = new EventTarget();

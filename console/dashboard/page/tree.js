@@ -126,7 +126,7 @@ export class Tree {
     set(one, "at", row.path === this.at, (is) => { one.element.classList.toggle("at", is); one.element.setAttribute("aria-selected", is); });
     set(one, "fit", Boolean(this.fits?.has(row.path)), (is) => one.element.classList.toggle("fit", is));
     set(one, "kind", row.kind, () => { one.kind.textContent = shortKind(row.kind); one.kind.title = row.kind; });
-    const hangs = turn >= 1;
+    const hangs = turn >= 1 && !row.rests;
     set(one, "state", hangs && row.state === "running" ? "in a turn" : row.state, (text) => { one.state.textContent = text; });
     set(one, "grave", hangs ? (turn >= 5 ? "ill" : "odd") : gravity(row.state), (grave) => { one.state.className = `st ${grave}`; });
     heated(one, "queued", row.queued, [1, 10, 100, 1000]);
@@ -135,7 +135,7 @@ export class Tree {
     const share = process && row.allowed ? process.memory / row.allowed : 0;
     set(one, "memory", process ? bytes(process.memory) : "", (text) => { one.memory.textContent = text; });
     set(one, "mheat", share ? heat(share, [0.4, 0.5, 0.6, 0.8]) : 0, (h) => { one.memory.className = `num mb heat ${h ? `h${h}` : ""}`; });
-    const more = [hangs ? `${shortKind(row.turn)} for ${seconds(turn)}` : "", row.place === "task" ? "" : row.place, row.recovery, row.mechanism.join(" + "), row.names.join(", ")];
+    const more = [turn >= 1 ? `${row.rests ? "rests in " : ""}${shortKind(row.turn)} for ${seconds(turn)}` : "", row.place === "task" ? "" : row.place, row.recovery, row.mechanism.join(" + "), row.names.join(", ")];
     set(one, "more", more.filter(Boolean).join(", "), (text) => { one.more.textContent = text; one.more.title = text; });
   }
 

@@ -24,7 +24,7 @@ from holdfast.console.dashboard.troubles import (
 )
 from holdfast.console.overview import ActorRow
 from holdfast.events import __all__ as KINDS
-from holdfast.system.history.why import RULES
+from holdfast.system.history.why import AT_REST, NO_TROUBLE, REST_BELOW, RULES
 
 NOW = 1_000_000.0
 
@@ -47,7 +47,7 @@ def seen(
 
 
 def test_there_is_advice_for_each_cause_and_for_no_other() -> None:
-    assert ADVICE.keys() == RULES.keys()
+    assert ADVICE.keys() == RULES.keys() - NO_TROUBLE
     assert ADVICE.keys() >= OF_CHILDREN
     assert set(TELLING) <= set(KINDS)
     orders = {order for one in [*ADVICE.values(), NOT_THERE] for order in one.orders}
@@ -83,6 +83,14 @@ def test_of_very_many_those_who_look_worst_are_asked() -> None:
 
 def test_who_is_well_is_left_out() -> None:
     assert troubles(seen(row("/app/x")), {"/app": [], "/app/x": []}) == []
+
+
+def test_who_rests_as_it_has_said_is_left_out() -> None:
+    resting = row("/app/x", turn="m.Go", turn_seconds=NOW - 3600.0, rests=True)
+    assert suspects(seen(resting)) == ["/app"]
+    assert seen_causes(seen(resting), "/app/x") == []
+    answers = {"/app": [(REST_BELOW, "Its child x has slept for 1 s.")], "/app/x": [(AT_REST, "/app/x has slept.")]}
+    assert troubles(seen(resting), answers) == []
 
 
 def test_who_waits_for_another_one_leads_there() -> None:

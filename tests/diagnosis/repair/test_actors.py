@@ -11,7 +11,7 @@ from holdfast import diagnosis
 from holdfast.actors.errors import NoSuchActor
 from holdfast.actors.events import DeadLetter
 from holdfast.diagnosis.engine import State
-from holdfast.diagnosis.literals import ok, running
+from holdfast.diagnosis.literals import Literal, ok, running
 from holdfast.diagnosis.model import System
 from holdfast.diagnosis.observations import Observation
 from holdfast.diagnosis.observers import GeneralObserver, Limits, Manner, NodeObserver, Property
@@ -108,6 +108,12 @@ class Cache(hf.Actor):
     @hf.on(Quote)
     def _quote(self, message: Quote) -> int:
         return 1
+
+
+class Clerk(hf.Actor):
+    @hf.on(Hang)
+    async def _rest(self, message: Hang) -> None:
+        await self.ctx.sleep(3600.0)
 
 
 class Asker(hf.Actor):
@@ -328,6 +334,57 @@ async def test_an_observer_that_lies_about_who_runs_costs_no_restart(shop: Shop)
     assert "look whether liar is right to say not running(shop/feed)" in over.plan
     await asyncio.sleep(60.0)
     assert shop.done() == []
+
+
+async def lie(shop: Shop, about: Literal) -> None:
+    """Say for a long time that something does not hold."""
+    word = Observation(~about, shop.system._node.loop.time(), "liar", 1000.0)
+    await shop.system.publish(diagnosis.OBSERVATIONS, word)
+
+
+async def test_who_rests_is_not_restarted_because_somebody_says_that_it_does_not_run(shop: Shop) -> None:
+    keeper = shop.system.ref("/t/shop", hf.Supervisor)
+    await keeper.ask(hf.StartChild(hf.child("clerk", hf.start(Clerk), recovery=hf.hybrid())))
+    await diagnosis.watch(shop.system, repair="on", policy=POLICY)
+    await asyncio.sleep(20.0)
+    await nobody_looks(shop)
+    shop.system.ref("/t/shop/clerk", Clerk).tell(Hang())
+    await lie(shop, running("shop/clerk"))
+    over = await shop.hear(GaveUp)
+    assert over.why == "shop/clerk runs and answers, although it is said not to run"
+    await asyncio.sleep(60.0)
+    assert shop.done() == []
+
+
+@pytest.mark.parametrize("where", ["elsewhere", "below the same supervisor"])
+async def test_what_is_harmless_does_not_wait_for_the_approval_of_what_is_not(shop: Shop, where: str) -> None:
+    office = "/t/shop" if where == "below the same supervisor" else "/t/office"
+    spec = hf.child("clerk", hf.start(Clerk))
+    if office == "/t/office":
+        await shop.system.start(hf.supervisor("office", children=[spec]))
+    else:
+        await shop.system.ref(office, hf.Supervisor).ask(hf.StartChild(spec))
+    model = System()
+    model.node("clerk", out=["/news"])
+    model.node("feed", out=["/prices"])
+    addresses = {"clerk": f"{office}/clerk", "feed": "/t/shop/feed"}
+    rate = diagnosis.observer("prices", hf.start(GeneralObserver, "/prices", 5.0))
+    policy = Policy(verify=8.0, settle=1.0, approval=300.0)
+    await diagnosis.watch(shop.system, model, [rate], addresses=addresses, repair="on", policy=policy)
+    await asyncio.sleep(20.0)
+    await lie(shop, ok("/news"))
+    first = await shop.hear(ApprovalWanted)
+    assert (shop.done(), [str(step) for step in first.steps]) == (["restart_child(clerk)"], ["restart_subtree(clerk)"])
+    shop.part("feed").tell(Freeze())
+    await asyncio.sleep(40.0)
+    last = [one for one in shop.told if isinstance(one, ApprovalWanted)][-1]
+    if office == "/t/shop":  # The restart of the supervisor is one of the feed, too.
+        assert shop.done() == ["restart_child(clerk)"]
+        assert {str(step) for step in last.steps} == {"restart_child(feed)", "restart_subtree(clerk)"}
+    else:
+        assert shop.done() == ["restart_child(clerk)", "restart_child(feed)"]
+        assert [str(step) for step in last.steps] == ["restart_subtree(clerk)"]
+        assert shop.part("feed")._cell.life == 2
 
 
 async def test_an_observer_that_lies_about_an_output_costs_one_restart_and_no_second(shop: Shop) -> None:

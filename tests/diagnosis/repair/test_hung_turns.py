@@ -11,6 +11,11 @@ from holdfast.diagnosis.engine import State
 from holdfast.diagnosis.repair import Policy, Repaired
 
 IN_TIME = 60.0
+RESTS = [
+    pytest.param("sleep", None, id="sleep"),
+    pytest.param("sleep", hf.hybrid(), id="recorded sleep"),
+    pytest.param("wait", hf.hybrid(), id="recorded wait"),
+]
 POLICY = Policy(verify=5.0, settle=0.2, cool_down=0.2)
 
 
@@ -23,9 +28,28 @@ class Hang(hf.Message): ...
 class Spin(hf.Message): ...
 
 
+class Signal(hf.Message): ...
+
+
+class Rest(hf.Message):
+    how: str
+
+
 class Node(hf.Actor):
     def __init__(self) -> None:
         self.counted = 0
+
+    @hf.on(Rest)
+    async def rest(self, message: Rest) -> None:
+        """A sleep, or a wait for a signal; a short sleep, behind which the turn hangs."""
+        if message.how == "wait":
+            await self.ctx.wait_for(Signal)
+        await self.ctx.sleep(3.0 if message.how == "hang" else 3600.0)
+        await asyncio.Event().wait()
+
+    @hf.on(Signal)
+    def take(self, message: Signal) -> None:
+        pass
 
     @hf.on(Count)
     def count(self, message: Count) -> int:
@@ -79,3 +103,33 @@ async def test_an_actor_whose_turn_hangs_again_is_healed_by_repair(isolation: An
         assert (type(aside.message), aside.attempts) == (type(bad), 2)
         assert await node.ask(Count(), timeout=IN_TIME) == last + 1
         assert (await watching.diagnosis()).state is State.HEALTHY
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+@pytest.mark.parametrize(("how", "recovery"), RESTS)
+async def test_a_turn_that_rests_as_it_has_said_does_not_hang(how: str, recovery: Any, isolation: Any) -> None:
+    spec = hf.child("node", hf.start(Node), isolation=isolation, recovery=recovery, shutdown="brutal_kill")
+    async with hf.ActorSystem("t", log=False) as system:
+        await system.start(hf.supervisor("all", children=[spec], intensity=20))
+        node = system.ref("/t/all/node", Node)
+        await node.ask(Count(), timeout=IN_TIME)
+        node.tell(Rest(how))
+        watching = await diagnosis.watch(system, seconds=0.1, hung_after=0.3, repair="on", policy=POLICY)
+        for _ in range(30):
+            await asyncio.sleep(0.1)
+            assert (await watching.diagnosis()).state is not State.FAULTY
+        assert len(system.lives(node)) == 1
+
+
+@pytest.mark.asyncio(loop_factories=["virtual"])
+async def test_a_turn_that_hangs_behind_its_rest_is_seen() -> None:
+    async with hf.ActorSystem("t", log=False) as system:
+        await system.start(hf.supervisor("all", children=[hf.child("node", hf.start(Node), recovery=hf.hybrid())]))
+        node = system.ref("/t/all/node", Node)
+        await node.ask(Count())
+        watching = await diagnosis.watch(system, seconds=0.1, hung_after=2.0, repair="off")
+        node.tell(Rest("hang"))
+        await asyncio.sleep(4.5)
+        assert (await watching.diagnosis()).state is State.HEALTHY
+        await asyncio.sleep(6.0)
+        assert [one.bad for one in (await watching.diagnosis()).candidates] == [("all/node",)]

@@ -17,6 +17,55 @@ KILLS = "tests/checkpoint/test_kill_counts.py"
 HUNG = "tests/diagnosis/repair/test_hung_turns.py"
 
 CHECKS = {
+    "a turn that rests does not hang": Check(
+        "diagnosis/observers/node_observer.py",
+        "            self._rested[cell.path] = self.now\n",
+        "            pass\n",
+        HUNG,
+        "rests_as_it_has_said and wait and task",
+    ),
+    "that a recorded turn in a process rests is known": Check(
+        "diagnosis/observers/node_observer.py",
+        "status = known_at_home(told, cell)",
+        "status = told",
+        HUNG,
+        "rests_as_it_has_said and wait and process",
+    ),
+    "the time behind a rest counts": Check(
+        "diagnosis/observers/node_observer.py",
+        "self.now - self._rested.get(cell.path, -math.inf)",
+        "(0.0 if cell.path in self._rested else math.inf)",
+        HUNG,
+        "hangs_behind_its_rest",
+    ),
+    "who rests answers": Check(
+        "diagnosis/repair/ping.py",
+        "rests = first.turn_rests or second.turn_rests",
+        'rests = ""',
+        ACTORS,
+        "who_rests_is_not_restarted",
+    ),
+    "what is harmless does not wait for what is dangerous": Check(
+        "diagnosis/repair/repairer.py",
+        '        if self._memory.stance == "on":  # Of what is left the next round plans.\n',
+        "        if False:\n",
+        ACTORS,
+        "what_is_harmless and elsewhere",
+    ),
+    "what is below what is dangerous waits with it": Check(
+        "diagnosis/repair/harmless.py",
+        'above = {(ADDRESS, "/".join(parts[:count])) for count in range(1, len(parts))}',
+        "above = set[Atom]()",
+        ACTORS,
+        "what_is_harmless and below",
+    ),
+    "a plan that is overtaken is not waited for": Check(
+        "diagnosis/repair/repairer.py",
+        "            if not is_same and left <= 0:\n",
+        "            if is_same and left > math.inf:\n",
+        ACTORS,
+        "what_is_harmless and elsewhere",
+    ),
     "a turn that repair has to cut off counts against its message": Check(
         "diagnosis/repair/stock.py",
         ", older=older, blames_turn=True)",
