@@ -27,7 +27,7 @@ PLACES: dict[str, dict[str, Any]] = {
     "protected": {"mechanism": hf.ftm.PBR()},
     "active": {"mechanism": hf.ftm.LFR()},
 }
-HANDLES = {
+HANDLES: dict[type[Any], tuple[type[Any], ...]] = {
     hf.Timer: (LoopTimer, RecordedTimer),
     hf.ReplyHandle: (AskHandle, RecordedReplyHandle),
     hf.Monitor: (LifeMonitor, RecordedMonitor),
@@ -63,7 +63,8 @@ class User(hf.Actor):
     @hf.on(Use)
     async def use(self, message: Use) -> Any:
         used = USES[message.name](self)
-        return await used if inspect.isawaitable(used) else used
+        reply = await used if inspect.isawaitable(used) else used
+        return "done" if reply is None else reply
 
     @hf.on(Nothing)
     def nothing(self, message: Nothing) -> None:
@@ -104,7 +105,8 @@ async def waits(work: Awaitable[Any]) -> str:
 
 
 async def publishes(user: User) -> str:
-    return str(await user.ctx.publish("/nothing", Nothing()))
+    await user.ctx.publish("/nothing", Nothing())
+    return "published"
 
 
 async def in_background(user: User) -> str:
@@ -115,10 +117,6 @@ async def in_background(user: User) -> str:
 def forwards(user: User) -> str:
     user.ctx.forward(user.peer)
     return "not this one"
-
-
-def pipes(user: User) -> str:
-    return str(user.ctx.pipe_to_self(asyncio.sleep(0), lambda _: Nothing()))
 
 
 def one() -> int:
@@ -133,12 +131,12 @@ USES: dict[str, Callable[[User], Any]] = {
     "flush": lambda user: waits(user.ctx.flush()),
     "forward": forwards,
     "life": lambda user: type(user.ctx.life).__name__,
-    "link": lambda user: str(user.ctx.link(user.peer)),
+    "link": lambda user: user.ctx.link(user.peer),
     "message_id": lambda user: type(user.ctx.message_id).__name__,
     "monitor": lambda user: monitor(user, user.ctx.monitor(user.peer)),
     "now": lambda user: type(user.ctx.now()).__name__,
     "path": lambda user: user.ctx.path,
-    "pipe_to_self": pipes,
+    "pipe_to_self": lambda user: user.ctx.pipe_to_self(asyncio.sleep(0), lambda _: Nothing()),
     "publish": publishes,
     "random": lambda user: str(isinstance(user.ctx.random, random.Random)),
     "ref": lambda user: user.ctx.ref.path,
@@ -147,14 +145,14 @@ USES: dict[str, Callable[[User], Any]] = {
     "sleep": lambda user: waits(user.ctx.sleep(0.0)),
     "sleep_until": lambda user: waits(user.ctx.sleep_until(0.0)),
     "spawn": lambda user: str(user.ctx.spawn(hf.start(Peer)).path.startswith("/app/user/")),
-    "stash": lambda user: str(user.ctx.stash()),
-    "stop": lambda user: str(user.ctx.stop()),
-    "subscribe": lambda user: str(user.ctx.subscribe("/nothing")),
+    "stash": lambda user: user.ctx.stash(),
+    "stop": lambda user: user.ctx.stop(),
+    "subscribe": lambda user: user.ctx.subscribe("/nothing"),
     "tell_after": lambda user: timer(user, user.ctx.tell_after(3600.0, Nothing())),
     "trap_exits": trap,
-    "unlink": lambda user: str(user.ctx.unlink(user.peer)),
-    "unstash": lambda user: str(user.ctx.unstash()),
-    "unsubscribe": lambda user: str(user.ctx.unsubscribe("/nothing")),
+    "unlink": lambda user: user.ctx.unlink(user.peer),
+    "unstash": lambda user: user.ctx.unstash(),
+    "unsubscribe": lambda user: user.ctx.unsubscribe("/nothing"),
     "uuid": lambda user: str(isinstance(user.ctx.uuid(), uuid.UUID)),
     "wait_for": lambda user: waits(user.ctx.wait_for(Nothing, timeout=0.001)),
     "watch": lambda user: monitor(user, user.ctx.watch(user.peer)),
@@ -167,7 +165,7 @@ def public(kind: type) -> set[str]:
     return {name for name in dir(kind) if not name.startswith("_")}
 
 
-def kinds_of(kind: type) -> Iterator[type]:
+def kinds_of(kind: type[Any]) -> Iterator[type[Any]]:
     yield kind
     for derived in kind.__subclasses__():
         yield from kinds_of(derived)
@@ -187,7 +185,7 @@ def test_each_context_is_called_as_every_other_is(kind: type) -> None:
 
 
 @pytest.mark.parametrize("handle", HANDLES, ids=lambda handle: handle.__name__)
-def test_each_handle_has_all_that_its_public_class_has(handle: type) -> None:
+def test_each_handle_has_all_that_its_public_class_has(handle: type[Any]) -> None:
     assert public(handle), "there is something that it can do"
     for kind in HANDLES[handle]:
         assert issubclass(kind, handle)
@@ -306,3 +304,58 @@ async def test_a_handle_says_in_each_life_whether_its_timer_is_active(place: str
             await alarms.send(Boom())
             assert await alarms.ask(Active(), timeout=20.0) == WANTED
             assert await alarms.ask(Rung(), timeout=20.0) == 1
+
+
+class Cancel(hf.Message): ...
+
+
+class Watcher(hf.Actor):
+    """Watches its peer twice, and keeps one handle."""
+
+    peer: hf.Binding[Peer]
+
+    def __init__(self) -> None:
+        self.watch: hf.Monitor | None = None
+        self.downs = 0
+
+    @hf.on(Arm)
+    def arm(self, message: Arm) -> None:
+        self.watch = self.ctx.watch(self.peer) if message.what == "watch" else self.ctx.monitor(self.peer)
+
+    @hf.on(Cancel)
+    def cancel(self, message: Cancel) -> None:
+        assert self.watch is not None
+        self.watch.cancel()
+
+    @hf.on(Boom)
+    def boom(self, message: Boom) -> None:
+        raise ValueError("it was to")
+
+    @hf.on(Rung)
+    def read(self, message: Rung) -> int:
+        return self.downs
+
+    def on_down(self, source: hf.ActorRef[hf.Actor], reason: hf.ExitReason, recovering: bool) -> None:
+        self.downs += 1
+
+
+@pytest.mark.parametrize("cancels", [True, False], ids=["cancelled", "kept"])
+@pytest.mark.parametrize("what", ["watch", "monitor"])
+@pytest.mark.parametrize("place", [place for place in PLACES if place not in ("plain", "process")])
+async def test_a_monitor_may_be_kept_in_the_state(place: str, what: str, cancels: bool) -> None:
+    async with hf.ActorSystem("app", log=False, intensity=1000) as system:
+        peer = await system.start(hf.child("peer", hf.start(Peer), restart="temporary"))
+        spec = hf.child("watcher", hf.start(Watcher), bindings={"peer": peer.path}, **PLACES[place])
+        watcher = await system.start(spec)
+        await watcher.ask(Arm(what))
+        if place.startswith("recorded") or place == "saved":
+            await system.checkpoint(watcher)
+        await watcher.send(Boom())
+        assert await watcher.ask(Rung(), timeout=20.0) == 0
+        if cancels:
+            await watcher.ask(Cancel(), timeout=20.0)
+        await system.stop(peer)
+        async with asyncio.timeout(20.0):
+            while await watcher.ask(Rung(), timeout=20.0) < (not cancels):
+                pass
+        assert await watcher.ask(Rung(), timeout=20.0) == (not cancels)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+from typing import Any
 
 import pytest
 
 import holdfast as hf
 
-PLACES = {
+PLACES: dict[str, dict[str, Any]] = {
     "plain": {},
     "process": {"isolation": "process"},
     "recorded": {"recovery": hf.hybrid(interval=3600.0)},
@@ -134,7 +135,7 @@ async def until_waiting(door: hf.ActorRef[Door], count: int) -> None:
 async def test_a_message_is_put_aside_however_it_has_come(place: str, way: str) -> None:
     async with hf.ActorSystem("app", log=False, intensity=0) as system:
         _, door = await started(system, place)
-        asked: asyncio.Task[str] | None = None
+        asked: asyncio.Future[str] | None = None
         match way:
             case "ask":
                 asked = asyncio.ensure_future(door.ask(Knock(way), timeout=30.0))
