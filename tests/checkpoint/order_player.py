@@ -76,7 +76,7 @@ class Gate(hf.Actor):
     """Hands on what comes."""
 
     @hf.on(Pass)
-    def hand_on(self, message: Pass) -> None:
+    def hand_on(self, message: Pass) -> Any:
         self.ctx.forward(self.ctx.find(RECEIVERS[message.to], Receiver))
 
 
