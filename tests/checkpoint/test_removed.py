@@ -64,7 +64,7 @@ CHECKS = {
         "end and task",
     ),
     "a child that would be there twice is not asked for again": Check(
-        "supervision/repeatable.py",
+        "supervision/services/repeatable.py",
         "return not start.fresh and start.id is not None",
         "return True",
         ORDERS,
