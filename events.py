@@ -63,6 +63,7 @@ from .actors.events import (
     TurnsLost,
     TurnSlow,
     TurnsSkipped,
+    TurnWaits,
 )
 from .ftm.alarms import (
     Diverged,
@@ -188,6 +189,7 @@ __all__ = [
     "TurnEnded",
     "TurnHung",
     "TurnSlow",
+    "TurnWaits",
     "TurnsLost",
     "TurnsSkipped",
     "WrongSuspicion",

@@ -234,24 +234,29 @@ class AskTimeout(HoldfastError):
     """No reply before the deadline.
 
     `handled` is False when the turn never started (safe to send again), None when that is unknown. `why` says why
-    nobody waits any longer, if it is not the time.
+    nobody waits any longer, if it is not the time; `turn`, of an operator's call, which turn is in its way.
     """
 
     actor: str
     seconds: float
     handled: bool | None = None
     why: str = ""
+    turn: str = ""
 
     def __str__(self) -> str:
         known = "it was not handled" if self.handled is False else "it may have been handled"
-        return f"{self.actor} did not reply{f' ({self.why})' if self.why else f' within {self.seconds:g} s'}; {known}"
+        until = f" ({self.why})" if self.why else f" within {self.seconds:g} s"
+        return f"{self.actor} did not reply{until}{f', for {self.turn}' if self.turn else ''}; {known}"
 
 
 class StillEnding(AskTimeout):
     """A life that was told to end has not yet: it does when its turn is over, unless it is killed before."""
 
     def __str__(self) -> str:
-        return f"{self.actor} has not ended within {self.seconds:g} s; it ends when its turn is over, or is killed"
+        turn = f", for {self.turn}" if self.turn else ""
+        return (
+            f"{self.actor} has not ended within {self.seconds:g} s{turn}; it ends when its turn is over, or is killed"
+        )
 
 
 class AskFailed(HoldfastError, text="{actor} ended while it handled the message: {reason}"):
@@ -400,6 +405,8 @@ class StartFailed(HoldfastError, text="{actor} could not be started: {reason}"):
 
     actor: str
     reason: str
+
+    struck_by = ""  # the common cause by which the life that was begun has ended, known in this process only
 
     def __init__(self, actor: str, reason: str = "") -> None:
         super().__init__(actor, reason.removeprefix(f"{actor} could not be started: "))  # Said once is enough.

@@ -452,6 +452,22 @@ class TurnSlow(Event, frozen=True, eq=False):
     seconds: float
 
 
+class TurnWaits(Event, frozen=True, eq=False):
+    """A turn has taken longer than `watch_waits`, with all that it waits for, and goes on: nothing was ended.
+
+    It is told once more each time that it has taken twice as long.
+
+    Attributes:
+        message: the type of what it handles; "" if its process does not answer.
+        seconds: that it has taken so far, at least.
+        at: the line of the user's code at which it waits; "" if that is not known.
+    """
+
+    message: str
+    seconds: float
+    at: str
+
+
 class LoopLagged(Event, frozen=True, eq=False):
     """The event loop of the root process came `seconds` late to what was due; `address` is the root's."""
 
@@ -459,11 +475,15 @@ class LoopLagged(Event, frozen=True, eq=False):
 
 
 class LogLine(Event, frozen=True, eq=False):
-    """A line that an actor's process wrote to its `stream`, stdout or stderr; `life` is the one that wrote it."""
+    """A line that an actor's process wrote to its `stream`, stdout or stderr; `life` is the one that wrote it.
+
+    `is_logged`: it becomes a log record, too; else the program was started with `log_lines=False`.
+    """
 
     stream: str
     text: str
     life: int = 0
+    is_logged: bool = True
 
 
 class MessageIn(Event, frozen=True, eq=False):

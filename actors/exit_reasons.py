@@ -23,6 +23,16 @@ class ExitReason(msgspec.Struct, frozen=True):
         """True for NORMAL and every Shutdown: a transient child is not restarted after it."""
         return False
 
+    @property
+    def common_cause(self) -> str:
+        """Name what outside of the actor has ended it and others: one fault, however many it strikes. "": nothing."""
+        return ""
+
+    @property
+    def blames_nobody(self) -> bool:
+        """Say whether the turn that was in hand has no part in the end, which was ordered or has a common cause."""
+        return bool(self.common_cause)
+
 
 class Normal(ExitReason, frozen=True):
     """The actor ended by itself, its work done."""
@@ -39,10 +49,16 @@ class Shutdown(ExitReason, frozen=True):
     """The actor was told to stop, or ended in good order; `detail` is the user's own."""
 
     detail: str = ""
+    because_of: str = ""
+    """The common cause of the ends that a supervisor has given up for."""
 
     @property
     def is_clean(self) -> bool:
         return True
+
+    @property
+    def common_cause(self) -> str:
+        return self.because_of
 
     def __str__(self) -> str:
         return f"shutdown ({self.detail})" if self.detail else "shutdown"
@@ -50,6 +66,10 @@ class Shutdown(ExitReason, frozen=True):
 
 class Killed(ExitReason, frozen=True):
     """The actor was killed: no hook ran."""
+
+    @property
+    def blames_nobody(self) -> bool:
+        return True
 
     def __str__(self) -> str:
         return "killed"
@@ -78,6 +98,10 @@ class Crash(ExitReason, frozen=True, eq=False):
         """The traceback of the exception, formatted when it is asked for."""
         return self.formatted if self.error is None else format_error(self.error)
 
+    @property
+    def common_cause(self) -> str:
+        return self.error.struck_by if isinstance(self.error, StartFailed) else ""
+
     def __str__(self) -> str:
         if self.type_name == START_FAILED and self.text:
             return self.text  # It says who could not be started, and why: once for each level is enough.
@@ -98,6 +122,20 @@ class Signal(ExitReason, frozen=True):
             return signal.Signals(self.number).name
         except ValueError:
             return f"signal {self.number}"
+
+
+class ForkServerDied(ExitReason, frozen=True):
+    """The OS process was ended because the fork server has died, whose child it was; `how` says what has ended that."""
+
+    pid: int
+    how: str = "cause unknown"
+
+    @property
+    def common_cause(self) -> str:
+        return f"fork server {self.pid}"
+
+    def __str__(self) -> str:
+        return f"its process ended with the fork server (pid {self.pid}: {self.how})"
 
 
 class Exited(ExitReason, frozen=True):
@@ -162,6 +200,7 @@ def start_failed(actor: str, reason: ExitReason) -> StartFailed:
     """The error of a start that ended for `reason`; its cause is what was raised, if that was in this process."""
     failed = StartFailed(actor, str(reason))
     failed.__cause__ = reason.error if isinstance(reason, Crash) else None
+    failed.struck_by = reason.common_cause
     return failed
 
 
@@ -180,12 +219,14 @@ class _Wire(msgspec.Struct, frozen=True):
 def pack_exit(reason: ExitReason) -> dict[str, object]:
     """`reason` as plain data for a frame."""
     match reason:
-        case Shutdown(detail=detail):
-            return {"exit": "Shutdown", "detail": detail}
+        case Shutdown(detail=detail, because_of=because_of):
+            return {"exit": "Shutdown", "detail": detail, "text": because_of}
         case Crash():
             return {"exit": "Crash", "type_name": reason.type_name, "text": reason.text, "formatted": reason.traceback}
         case Signal(number=number):
             return {"exit": "Signal", "number": number}
+        case ForkServerDied(pid=pid, how=how):
+            return {"exit": "ForkServerDied", "number": pid, "text": how}
         case Exited(code=code):
             return {"exit": "Exited", "number": code}
         case OutOfMemory(text=text):
@@ -211,7 +252,7 @@ def unpack_exit(data: object) -> ExitReason:
         case "Normal":
             return NORMAL
         case "Shutdown":
-            return Shutdown(wire.detail)
+            return Shutdown(wire.detail, wire.text)
         case "Killed":
             return KILLED
         case "NoProc":
@@ -220,6 +261,8 @@ def unpack_exit(data: object) -> ExitReason:
             return Crash(wire.type_name, wire.text, wire.formatted)
         case "Signal":
             return Signal(wire.number)
+        case "ForkServerDied":
+            return ForkServerDied(wire.number, wire.text)
         case "Exited":
             return Exited(wire.number)
         case "OutOfMemory":

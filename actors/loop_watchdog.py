@@ -29,9 +29,9 @@ RUNNER = run_loop.Runner._step.__code__
 """In its frame: the turn that the runner has."""
 
 
-def check_limits(lag: float | None, turns: float | None) -> None:
+def check_limits(**limits: float | None) -> None:
     """Refuse limits that are neither None nor a number > 0. Raises SpecError."""
-    for name, limit in (("watch_lag", lag), ("watch_turns", turns)):
+    for name, limit in limits.items():
         if limit is not None:
             check_seconds("ActorSystem", name, limit)
 

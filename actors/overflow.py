@@ -11,6 +11,8 @@ Overflow = Literal["block", "reject", "drop_newest", "drop_oldest", "latest"]
 Verdict = Literal["take", "wait", "refuse", "lose"]
 """The message is admitted; it waits for room; its sender is told that there is none; it is a dead letter."""
 
+FULL: Final = "mailbox full ("
+FULL_WHILE_HELD: Final = "there was no room while messages were held (for "
 DROPS: Final = frozenset(("drop_oldest", "latest"))
 """Policies that take back what was admitted: it must not be handed on before its turn."""
 
@@ -28,6 +30,21 @@ def decide(overflow: Overflow, capacity: int, *, is_ask: bool) -> tuple[Verdict,
             return "take", capacity - 1
         case "latest":
             return "take", 0
+
+
+def drop_reason(capacity: int, overflow: str) -> str:
+    """Why a message is a dead letter that a full mailbox does not keep by its policy."""
+    return f"{FULL}{capacity}, {overflow})"
+
+
+def held_drop_reason(capacity: int, overflow: str) -> str:
+    """Why a message is a dead letter that is not held during a recovery, by the policy of `held=`."""
+    return f"{FULL_WHILE_HELD}{capacity}, {overflow})"
+
+
+def is_of_policy(why: str) -> bool:
+    """Whether a dead letter is one by the overflow policy that somebody has chosen, as its `why` says."""
+    return why.startswith((FULL, FULL_WHILE_HELD))
 
 
 def check(where: str, capacity: Any, overflow: Any) -> None:

@@ -90,6 +90,10 @@ class Keeper(Protocol):
         """The facts whose keys begin so, oldest first."""
         ...
 
+    def noted(self, key: str) -> bytes | None:
+        """The fact of that name, or None."""
+        ...
+
 
 class NothingKept:
     """The keeper of a node without recovery: only facts are kept, until the node ends."""
@@ -133,6 +137,10 @@ class NothingKept:
         """The facts whose keys begin so, oldest first."""
         return {key: value for key, value in self._notes.items() if key.startswith(prefix)}
 
+    def noted(self, key: str) -> bytes | None:
+        """The fact of that name, or None."""
+        return self._notes.get(key)
+
 
 CHILDREN = "child "
 """How the keys of facts begin that a supervisor has a child; the child's address follows."""
@@ -141,3 +149,12 @@ CHILDREN = "child "
 def child_key(supervisor: str, name: str) -> str:
     """The key of the fact that a supervisor has a child of this name."""
     return f"{CHILDREN}{supervisor}/{name}"
+
+
+ENTRIES = "entries "
+"""How the keys of facts begin that say what a recorded actor holds in a registry; both addresses follow."""
+
+
+def entries_key(holder: str, registry: str) -> str:
+    """The key of the fact that says what a recorded actor holds in a registry. (No address has a line end.)"""
+    return f"{ENTRIES}{holder}\n{registry}"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 import msgspec
 
-from .inputs import Batch, TimerState
+from .inputs import Batch, Input, TimerState
 from .protocol import TICK, Answer, Clock, Out
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ class Timers:
         One that ran then, and does not run now, was cancelled or has come in a turn that is handled again.
         """
         wanted = self._same.get(out.to, out.to)
-        if wanted != out.to or wanted in self._states or wanted in self._made:
+        if out.to in self._same or wanted in self._states or wanted in self._made:
             self.claimed.add(wanted)
             return False
         clock = (out.name, out.body, out.interval)
@@ -163,7 +163,7 @@ class Timers:
         if timer.interval > 0:
             timer.due = max(timer.due + timer.interval, home.node.loop.time())
             timer.handle = home.node.loop.call_at(timer.due, self._tick, key)
-            if any(source.origin == key for source in home.ledger.open.values() if source.kind == TICK):
+            if self._waiting(key):
                 return  # One waits already.
         else:
             del self._states[key]
@@ -171,10 +171,16 @@ class Timers:
 
     def drop_ticks(self, timer: str, running: int, batch: Batch) -> None:
         """Ticks of a cancelled timer that wait do not come any more; the life forgets them by itself."""
-        home = self._home
-        for source in list(home.ledger.open.values()):
-            if source.kind == TICK and source.origin == timer and source.id != running:
-                home.end_without_turn(source, Answer(), batch)
+        for source in self._waiting(timer):
+            if source.id != running:
+                self._home.end_without_turn(source, Answer(), batch)
+
+    def _waiting(self, key: str) -> list[Input]:
+        """Ticks of a timer that wait. One that was put aside is a message like any other."""
+        ledger = self._home.ledger
+        ticks = [source for source in ledger.open.values() if source.kind == TICK and source.origin == key]
+        aside = ledger.stashed() if ticks else ()
+        return [source for source in ticks if source.id not in aside]
 
     def pause(self) -> None:
         """The address is given up: what remains runs on with the next life."""

@@ -71,6 +71,11 @@ class Input(Feed, gc=False, eq=False):
         """What it counts against the journal's limit, in bytes."""
         return len(self.body) + OVERHEAD
 
+    @property
+    def begins_by(self) -> float:
+        """Until when its turn may begin, on the loop's clock (0: always): then whoever has asked has given up."""
+        return 0.0 if self.ask is None else self.ask.deadline or EXPIRED
+
     def entry(self) -> Entry:
         """Its entry in the journal."""
         return "in", self.id, self.kind, self.name, self.body, self.time, self.sender, self.origin
@@ -78,17 +83,16 @@ class Input(Feed, gc=False, eq=False):
     def feed(
         self, turn: int = -1, pipes: tuple[int, ...] = (), *, has_begun: bool = False, was_asked: bool = False
     ) -> Feed:
-        """As the life gets it; what has begun is finished whatever its deadline.
+        """As the life gets it.
 
         `was_asked`: it was an ask when it was handled first, and is replayed as one.
         """
-        ask, kind, origin = self.ask, self.kind, self.origin
-        deadline = 0.0 if ask is None or has_begun else ask.deadline or EXPIRED
+        kind, origin = self.kind, self.origin
         if origin and kind not in (TICK, PIPE):
             origin = ""
         return Feed(
             self.id, turn, kind, self.name, self.body, self.time, self.sender,
-            was_asked or ask is not None, self.chain, pipes, deadline, origin, has_begun,
+            was_asked or self.ask is not None, self.chain, pipes, self.begins_by, origin, has_begun,
         )  # fmt: skip
 
 

@@ -96,7 +96,8 @@ class LongWaits:
     def _suits(self, source: Input, names: str, running: int) -> bool:
         """Whether an input is a message that a turn waits for, and nobody has begun it."""
         is_free = source.kind == MESSAGE and source.id != running and not source.held
-        return is_free and source.name in names.split("|") and source.id not in self._home.ledger.stashed()
+        is_wanted = is_free and source.name in names.split("|") and source.id not in self._home.ledger.stashed()
+        return is_wanted and not (source.begins_by and self._home.node.clock.is_past(source.begins_by))
 
     def takes(self, source: Input) -> bool:
         """Whether a message that has come is what a turn waits for; it has it then."""

@@ -156,8 +156,9 @@ class Feed(msgspec.Struct, array_like=True, tag=1, gc=False):
     """An input.
 
     `turn` is the number it had before the crash, -1 if it never ended; `pipes` have their result already; from
-    `deadline` on (on the loop's clock, 0: never) it is not begun any more; `origin` is the timer or the background
-    work that it comes from; `has_begun`: its turn has sent something, and has no end.
+    `deadline` on (on the loop's clock, 0: never) it is not begun any more, unless it `has_begun`, that is: its turn has
+    sent something, and has no end; `origin` is the timer or the background work that it comes from. `spent`: timers
+    whose messages came in turns before this one that are not handled again.
     """
 
     id: int
@@ -173,6 +174,7 @@ class Feed(msgspec.Struct, array_like=True, tag=1, gc=False):
     deadline: float = 0.0
     origin: str = ""
     has_begun: bool = False
+    spent: tuple[str, ...] = ()
 
 
 class Outcome(msgspec.Struct, array_like=True, tag=2):
@@ -205,7 +207,7 @@ class Go(msgspec.Struct, array_like=True, tag=3):
     Inputs in `gone` were stashed under replay and have ended since, in turns that are not replayed. `timers` run now.
     The input `begun` has sent something in a turn without an end: it comes first, before what a hook has put back.
     `ends`: the life is to end instead of going on, as a turn has said and no life has done yet. What turns up to
-    `ended` have said of that is done.
+    `ended` have said of that is done. `spent`: as of a `Feed`.
     """
 
     recovered: bool
@@ -215,6 +217,7 @@ class Go(msgspec.Struct, array_like=True, tag=3):
     begun: int = -1
     ends: EndWanted | None = None
     ended: int = -1
+    spent: tuple[str, ...] = ()
 
 
 class SnapshotNow(msgspec.Struct, array_like=True, tag=4):

@@ -17,6 +17,7 @@ from ..actors.kernel.actor import Actor
 from ..system.history.authors import ACTING, OPERATOR
 from ..system.history.evidence import PutAside, put_aside
 from ..system.transaction.change import Change
+from .asking import ask_by_name, tell_by_name
 from .declare.tree_plan import declare
 from .inspection import inspected
 from .overview import look_at
@@ -45,6 +46,7 @@ from .wire import (
     OrderRepair,
     Overview,
     RestartActor,
+    SendMessage,
     SettleQuarantined,
     Transact,
     Tree,
@@ -121,6 +123,8 @@ class ClientSession:
                 return await inspected(system, request.path, min(request.timeout, LONGEST))
             case RestartActor():
                 return await restart_actor(system, request.path, min(request.timeout, LONGEST), at_once=request.at_once)
+            case SendMessage():
+                return await self._send(request)
             case ControlActor():
                 return await self._control(request)
             case Transact():
@@ -207,6 +211,14 @@ class ClientSession:
             except HoldfastError as error:
                 failed.append(f"{one.address} {one.id}: {error}")
         return {"done": msgspec.to_builtins(done), "failed": failed}
+
+    async def _send(self, request: SendMessage) -> dict[str, Any]:
+        """The reply, or nothing if none is wanted."""
+        path, message, fields = request.path, request.message, request.fields
+        if request.asks:
+            return await ask_by_name(self._system, path, message, fields, min(request.timeout, LONGEST))
+        tell_by_name(self._system, path, message, fields)
+        return {}
 
     async def _control(self, request: ControlActor) -> Any:
         system, timeout = self._system, min(request.timeout, LONGEST)
@@ -317,7 +329,7 @@ def _options(args: list[Any]) -> dict[str, Any]:
 
 def as_told(change: Change) -> dict[str, Any]:
     """The steps of a transaction, and how the tree changes, as plain data."""
-    steps = [(step.number, step.verb, step.target, step.text) for step in change.steps]
+    steps = [(step.number, step.verb, step.target, step.text, step.note) for step in change.steps]
     return {"steps": steps, "difference": list(change.difference), "lost": list(change.lost)}
 
 

@@ -24,6 +24,7 @@ from .operate import (
     repairing,
     retrying,
     showing,
+    speaking,
 )
 from .service import doctor, project, service_run
 from .store_commands import store
@@ -102,6 +103,8 @@ for command in (
     looking.inspect,
     following.trace,
     following.logs,
+    speaking.ask,
+    speaking.tell,
     changing.suspend,
     changing.resume,
     changing.restart,

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from ..actors.errors import type_name
+from ..actors.control.orders import status_of
+from ..actors.errors import AskTimeout, type_name
 from ..actors.kernel.cell import Cell
 from ..actors.kernel.node import cell_kind
 from ..checkpoint.method import Method
@@ -16,7 +17,7 @@ from ..ftm.replica.replica import Replica
 from ..supervision.intensity import recent_restarts
 from ..supervision.spec import ChildSpec
 from ..supervision.supervisor import Supervisor
-from .overview import as_told, find, is_far, process_use, row_of
+from .overview import FAR_TIMEOUT, as_told, find, is_far, process_use, row_of
 
 if TYPE_CHECKING:
     from ..system.system import ActorSystem
@@ -26,14 +27,19 @@ async def inspected(system: ActorSystem, path: str, timeout: float) -> dict[str,
     """All that can be said of one actor, as plain data; of a child that is stopped only what its spec says.
 
     Raises:
-        NoSuchActor: nobody is known at the address. HoldfastError: it does not answer in time.
+        NoSuchActor: nobody is known at the address.
     """
     one = find(system, path)
     cell = one.cell
     if cell is None or cell.is_dead:
         return {"actor": msgspec.structs.asdict(row_of(one)), "spec": _spec_words(one.child and one.child.spec)}
-    status = await system.get_status(cell.ref, timeout=timeout)
-    row = as_told(row_of(one), status) if is_far(cell) else row_of(one)
+    row = row_of(one)
+    try:
+        status = await system.get_status(cell.ref, timeout=min(timeout, FAR_TIMEOUT))
+        seen = {"turn": status.turn or "", "turn_seconds": status.turn_seconds}
+        row = as_told(row, status) if is_far(cell) else msgspec.structs.replace(row, **seen)
+    except AskTimeout:  # Its process is blocked, or stopped: what is known here is all there is.
+        status, row = status_of(cell), as_told(row, None)
     more = cell.more
     ties = more.ties if more is not None and more.has_more else None
     protection = await system.protection(cell.ref)
@@ -41,6 +47,7 @@ async def inspected(system: ActorSystem, path: str, timeout: float) -> dict[str,
     return {
         "actor": msgspec.structs.asdict(row),
         "life": status.life,
+        "turn_at": status.turn_at,
         "turn_rests": status.turn_rests,
         "bindings": dict(status.bindings),
         "links": sorted(ties.links.values()) if ties is not None else [],

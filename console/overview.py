@@ -127,6 +127,13 @@ async def look_at(system: ActorSystem, *, parts: bool, paths: Iterable[str] | No
     return SystemLook(system.name, os.getpid(), time.monotonic(), rows, uses)
 
 
+async def silent_at_root(system: ActorSystem) -> list[str]:
+    """The children of the root for which no process answers."""
+    root = system._root
+    paths = [cell.path for cell in (root.children or {}).values()] if root is not None else []
+    return [row.path for row in (await look_at(system, parts=False, paths=paths)).rows if row.state == "silent"]
+
+
 def walk(top: Found, *, parts: bool) -> Iterator[Found]:
     """The address, and all below it, parents before children; children that do not run stand where they would."""
     waiting = [top]
@@ -228,7 +235,7 @@ def row_of(one: Found) -> ActorRow:
     return ActorRow(
         one.path,
         type_name(kind) if kind is not None else "",
-        status.state if status is not None else child.state if child is not None else "stopped",
+        _state_of(status, child),
         "task" if spec is None else "replicas" if spec.mechanism is not None else spec.isolation,
         one.pid,
         max(0, status.life - 1) if status is not None else 0,
@@ -243,6 +250,12 @@ def row_of(one: Found) -> ActorRow:
         (spec.limits.memory_bytes or 0) if spec is not None and spec.limits is not None else 0,
         status is not None and bool(status.turn_rests),
     )
+
+
+def _state_of(status: Status | None, child: Child | None) -> str:
+    if status is None or (child is not None and child.comes):
+        return child.state if child is not None else "stopped"
+    return status.state
 
 
 def names_of(cell: Cell | None) -> tuple[str, ...]:

@@ -30,7 +30,7 @@ from ..system.history.evidence import PutAside
 from ..system.history.lives import PastLife
 from ..system.history.pages import MOST_ON_PAGE, HistoryPage, question
 from ..system.last_lines.line_page import LogPage, log_question
-from ..system.transaction.operation import Step
+from ..system.transaction.operation import Step, described_steps
 from .overview import LOOK, SystemLook
 from .wire import (
     RESPONSE,
@@ -54,6 +54,7 @@ from .wire import (
     Overview,
     RepairVerb,
     RestartActor,
+    SendMessage,
     SettleQuarantined,
     Transact,
     Tree,
@@ -497,6 +498,16 @@ class RemoteSystem:
         ended: str = await self.call(RestartActor(text_of(target), timeout, at_once), timeout)
         return ended
 
+    async def send_message(
+        self, path: str, message: str, fields: str, *, asks: bool, timeout: float = 5.0
+    ) -> dict[str, Any]:
+        """Send a message of a class that the actor handles, with its fields as JSON.
+
+        Returns the reply as plain data (`reply`), or as Python writes it (`text`); nothing of either if none is wanted.
+        """
+        said: dict[str, Any] = await self.call(SendMessage(path, message, fields, asks, timeout), timeout)
+        return said
+
     async def terminate(self, target: RemoteTarget, *, timeout: float = 5.0) -> str:
         """End a life in good order; its supervisor then does as its spec says. Returns its exit reason in words."""
         reason: str = await self._control("terminate", target, timeout, changes=True)
@@ -695,8 +706,7 @@ class RemoteChange:
 
     def describe(self) -> str:
         """The steps, and how the tree changes, in words."""
-        lines = [f"{step.number}. {step.text}" for step in self.steps] or ["nothing to do"]
-        return "\n".join([*lines, *self._difference])
+        return "\n".join([*described_steps(self.steps), *self._difference])
 
 
 def text_of(target: RemoteTarget) -> str:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from ..actors.control.orders import Ready
 from ..actors.control.orders_lane import order
-from ..actors.errors import AskTimeout, HoldfastError, SpecError
+from ..actors.errors import AskTimeout, SpecError
 from ..actors.exit_reasons import KILLED, SHUTDOWN, Crash, ExitReason
 from ..actors.kernel.cell import Cell
 from ..supervision.intensity import recent_restarts
@@ -19,10 +19,6 @@ if TYPE_CHECKING:
 
 ASKED = Crash("holdfast.Restart", "an operator has asked for it")
 """The reason of a life that would not be followed by another one if it ended as when it is stopped."""
-
-
-STATUS_WITHIN = 1.0
-"""Seconds in which an actor says what it is at."""
 
 
 async def restart_actor(system: ActorSystem, path: str, timeout: float, *, at_once: bool = False) -> str:
@@ -54,23 +50,13 @@ async def restart_actor(system: ActorSystem, path: str, timeout: float, *, at_on
     try:
         ended = await system.terminate(ref, reason, timeout=timeout)
     except AskTimeout as late:
-        raise NotEnded(path, timeout, await _turn_of(system, path)) from late
+        raise NotEnded(path, timeout, f", for {late.turn}" if late.turn else "") from late
     if not at_once:  # The next life of one that is killed may hang as this one did: it is not asked.
         try:
             await order(ref._cell.living, Ready(), timeout)
         except AskTimeout as late:
             raise NotUpYet(path, str(ended), timeout, above.path) from late
     return str(ended)
-
-
-async def _turn_of(system: ActorSystem, path: str) -> str:
-    """The turn that an actor is in, in words, and the line at which it waits; "" if none is known."""
-    try:
-        status = await system.get_status(path, timeout=STATUS_WITHIN)
-    except HoldfastError:
-        return ""
-    at = f" (at {status.turn_at})" if status.turn_at else ""
-    return f", for its turn of {status.turn} has run for {status.turn_seconds:.0f} s{at}" if status.turn else ""
 
 
 def check_allowed(above: Cell, path: str) -> None:

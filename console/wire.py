@@ -225,6 +225,16 @@ class RestartActor(ControlRequest, tag="restart", frozen=True):
     at_once: bool = False
 
 
+class SendMessage(ControlRequest, tag="send", frozen=True):
+    """Send one actor a message of a class that it handles, with `fields` as a JSON object; `asks`: for its reply."""
+
+    path: str
+    message: str
+    fields: str
+    asks: bool
+    timeout: float = 5.0
+
+
 class FollowActor(ControlRequest, tag="follow", frozen=True):
     """Follow the messages of one actor, for as long as this connection lasts."""
 
@@ -375,6 +385,7 @@ AnyRequest = (
     | Overview
     | InspectActor
     | RestartActor
+    | SendMessage
     | FollowActor
     | NextEvents
     | CountTurns

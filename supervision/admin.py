@@ -231,12 +231,16 @@ class EndedChildren(Message[list[EndedChild]]):
 
 
 class ChildCounts(Message[None]):
-    """The number of specs, how many of them run, and how many are supervisors and workers, running or not."""
+    """The number of specs, how many of them run, and how many are supervisors and workers, running or not.
+
+    `awaited`: how many wait for somebody to whom their specs bind them, by the address of that one.
+    """
 
     specs: int
     active: int
     supervisors: int
     workers: int
+    awaited: dict[str, int] = msgspec.field(default_factory=dict[str, int])
 
 
 class CountChildren(Message[ChildCounts]):

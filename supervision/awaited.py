@@ -28,16 +28,29 @@ Listed = Callable[[Cell], Mapping[str, Child] | None]
 """The children of a supervisor that lives in this process; None if there is none at a cell."""
 
 
-def not_there(node: Node, path: str, spec: ChildSpec) -> str:
+def not_there(node: Node, listed: Listed, path: str, spec: ChildSpec) -> str:
     """The first address outside its own that a child needs to start, and where nobody lives; "" if there is none."""
     needed = (to for to in _bound_to(spec) if not to.startswith(f"{path}/"))
-    return next((to for to in needed if not lives(node, to)), "")
+    return next((to for to in needed if not lives(node, listed, to)), "")
 
 
-def lives(node: Node, path: str) -> bool:
-    """Whether somebody lives at an address, or is about to by the order of its supervisor."""
+def lives(node: Node, listed: Listed, path: str) -> bool:
+    """Whether somebody lives at an address, or is being started there by its supervisor."""
     cell = node.find(path)
-    return cell is not None and not cell.is_dead
+    if cell is None or cell.is_dead:
+        return False
+    siblings = None if cell.parent is None or cell.life else listed(cell.parent)
+    one = None if siblings is None else siblings.get(cell.name)
+    return one is None or not one.comes  # Who only comes has its address, and perhaps waits itself.
+
+
+def tell_wait(supervisor: Cell) -> None:
+    """Have the root know that children of a supervisor begin to wait for somebody to whom they are bound."""
+    uplink = supervisor.node.ports.uplink
+    if uplink is None:
+        supervisor.node.supervised.waiting.add(supervisor)
+    else:
+        uplink.command(supervisor, "waits", {})
 
 
 def _bound_to(spec: ChildSpec) -> Iterator[str]:
@@ -75,7 +88,7 @@ class Prospects:
         """
         node = self._node
         for port, path in one.spec.bindings.items():
-            if port in one.spec.late or lives(node, path):
+            if port in one.spec.late or lives(node, self._listed, path):
                 continue
             one.awaited = path
             circle = self._circle(AwaitedStart(who, path))

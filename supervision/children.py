@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from ..actors.errors import NoSuchActor, StartFailed, type_name
@@ -45,6 +45,7 @@ class Child:
     up: asyncio.Future[None] | None = None  # a start that is waited for outside our turn; None once it is known or void
     row: StartRow | None = None  # those that are started one after another, and it is one of them
     candidate: int = 0  # as whose candidate it was started; 0: it is none
+    comes: bool = False  # it has its address, and is bound when its first life there begins
     noted: Any = None  # what its supervisor's journal says of it, if that is known
     awaited: str = ""  # the address that its start waits for, because its spec binds it to that
     waits_apart: bool = False  # and nobody waits for its start
@@ -72,30 +73,68 @@ def complete(own: Cell, spec: ChildSpec) -> ChildSpec:
 
 
 def new_cell(own: Cell, one: Child) -> Cell:
-    """An address below a supervisor's, for the lives of a child.
+    """An address below a supervisor's, for the lives of a child, which is bound as its spec says.
 
     Raises:
         StartFailed: a binding points nowhere. NameTaken: somebody else lives there.
     """
-    node, spec = own.node, complete(own, one.spec)
-    one.spec = spec
-    targets = {
-        port: node.cell_at(path) if port in spec.late else node.find(path) for port, path in spec.bindings.items()
-    }
-    for port, target in targets.items():  # Before there is a cell: a child that cannot start leaves no name taken.
+    one.spec = complete(own, one.spec)
+    targets = _targets(own, one.spec)  # Before there is a cell: a child that cannot start leaves no name taken.
+    cell = _cell_of(own, one.spec)
+    _bind(cell, targets)
+    return cell
+
+
+def expect(own: Cell, one: Child) -> None:
+    """Make the address of a child that is to come back: it is found there from now on, and what is sent to it waits.
+
+    Raises:
+        SpecError: its spec does not go with what is said of it elsewhere. NameTaken: somebody else lives there.
+    """
+    one.spec = complete(own, one.spec)
+    cell = one.cell = _cell_of(own, one.spec)
+    cell.table, one.comes = one.spec.start.kind._table, True
+    cell.host.home.expect(cell)
+
+
+def bind_expected(own: Cell, one: Child, cell: Cell) -> None:
+    """Bind a child that was expected, for its first life begins; what was bound meanwhile stays so.
+
+    Raises:
+        StartFailed: a binding points nowhere.
+    """
+    targets = _targets(own, one.spec)
+    known = cell.extra().bindings if cell.extra().has_more else {}
+    _bind(cell, {port: target for port, target in targets.items() if port not in known})
+    one.comes = False
+
+
+def _targets(own: Cell, spec: ChildSpec) -> dict[str, Cell]:
+    """Where the bindings of a child lead. Raises StartFailed: one of them leads nowhere."""
+    node, targets = own.node, dict[str, Cell]()
+    for port, path in spec.bindings.items():
+        target = node.cell_at(path) if port in spec.late else node.find(path)
         if target is None:
-            missing = NoSuchActor(spec.bindings[port])
+            missing = NoSuchActor(path)
             raise StartFailed(f"{own.path}/{spec.id}", f"binding {port!r}: {missing}") from missing
+        targets[port] = target
+    return targets
+
+
+def _cell_of(own: Cell, spec: ChildSpec) -> Cell:
+    node = own.node
     cell = node.cell_below(own, spec.id, node.ports.host_for(spec))
     cell.spec = spec
     cell.extra().start = spec.start
     if spec.mailbox is not None:
         node.bound(cell, spec.mailbox)
-    is_claimed = node.ports.uplink is not None  # The root has not bound it, though it may have named it in a recipe.
-    for port, target in targets.items():
-        assert target is not None
-        node.bind(cell, port, target, is_claimed=is_claimed)
     return cell
+
+
+def _bind(cell: Cell, targets: Mapping[str, Cell]) -> None:
+    is_claimed = cell.node.ports.uplink is not None  # The root has not bound it, though it may be named in a recipe.
+    for port, target in targets.items():
+        cell.node.bind(cell, port, target, is_claimed=is_claimed)
 
 
 def tell_stopped(cell: Cell, by: str, because: str) -> None:

@@ -8,6 +8,7 @@ arguments only.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import dataclasses
 from collections import Counter
 from collections.abc import Callable
@@ -23,12 +24,12 @@ from ..actors.kernel.cell import DOWN, GONE, Cell
 from ..actors.persistence import child_key
 from ..actors.process.resource_limits import Limits
 from .admin import AlreadyStarted, DeleteChild, MaxChildren, NotSupported, RestartChild, StartChild, opened
-from .awaited import EACH_LOOK, LOOK_AGAIN, TELL_AFTER, lives, not_there
-from .children import STARTING, Child, StartRow, complete, tell_ended_with
+from .awaited import EACH_LOOK, LOOK_AGAIN, TELL_AFTER, lives, not_there, tell_wait
+from .children import STARTING, Child, StartRow, complete, expect, tell_ended_with
 from .noted import FIELDS, Noted, OfTemplate, filled, first_noted, pack_noted, renewed, unpack_noted
 from .rules import Rule
 from .spec import NAMELESS, ChildSpec, Flags, Isolation, Plan, Restart, Shutdown, check_spec, child
-from .supervisor import Supervisor
+from .supervisor import Supervisor, listed_at
 from .supervisor_changes import Bequest, check_place, check_subtree, has_stood_down
 
 MADE_UP = b""
@@ -73,15 +74,25 @@ class DynamicSupervisor(Supervisor):
             except HoldfastError as error:  # It stays in the journal: perhaps its class is only not there today.
                 node.emit(ChildStartFailed(f"{self.ctx.path}/{name}", str(error)))
         self._children.update((one.spec.id, one) for one in come)
+        self._expect(come)
         waiting = await self._come_back(come)
         if waiting:
+            tell_wait(self.ctx._cell)
             self._errand(self._come_back_later(waiting))
+
+    def _expect(self, come: list[Child]) -> None:
+        """Those that were there before are found from now on, however long each of them has to wait for its start."""
+        if self.ctx._cell.node.ports.uplink is not None:
+            return  # The root finds nobody in this process whose life has not begun.
+        for one in come:
+            with contextlib.suppress(HoldfastError):  # Its start, which fails for the same reason, tells of it.
+                expect(self.ctx._cell, one)
 
     async def _come_back(self, come: list[Child]) -> list[Child]:
         """Start those that were there before; returns those of them to whom somebody is missing that they need."""
         row, waiting = StartRow(come, STARTING), list[Child]()
         while (one := row.next()) is not None:
-            one.awaited = not_there(self.ctx._cell.node, self._path_of(one), one.spec)
+            one.awaited = not_there(self.ctx._cell.node, listed_at, self._path_of(one), one.spec)
             one.waits_apart = bool(one.awaited)
             if one.awaited:
                 waiting.append(one)
@@ -100,7 +111,7 @@ class DynamicSupervisor(Supervisor):
             needed = Counter(one.awaited for one in waiting)
             await asyncio.sleep(LOOK_AGAIN + EACH_LOOK * len(needed))
             waiting = [one for one in waiting if one.row is not None]  # Else it was stopped.
-            if any(lives(node, path) for path in needed):
+            if any(lives(node, listed_at, path) for path in needed):
                 waiting = await self._come_back(waiting)
             elif (seconds := node.loop.time() - begun) >= TELL_AFTER:
                 for path in needed.keys() - told:
@@ -264,6 +275,7 @@ class DynamicSupervisor(Supervisor):
             raise AlreadyStarted(spec.id, self.ctx._cell.node.cell_at(f"{self.ctx.path}/{spec.id}").ref)
         most = self._flags.max_children
         if most is not None and len(self._children) >= most:
+            self.ctx._cell.node.numbers.no_room["children", spec.start.kind] += 1
             raise MaxChildren(most)
 
     async def _come_so_far(self, name: str) -> Child | None:
@@ -319,7 +331,7 @@ async def stop_together(cells: list[Cell]) -> None:
     for cell in cells:
         spec: ChildSpec | None = cell.spec
         if cell.state in (DOWN, GONE):
-            lifecycle.retire(cell, "its parent has stopped")
+            lifecycle.retire_with_parent(cell)
             continue
         waiting.append((cell, lifecycle.stop_and_wait(cell) if spec is None else spec.begin_stop(cell)))
         patience = lifecycle.PATIENCE if spec is None else spec.shutdown
@@ -334,7 +346,7 @@ async def stop_together(cells: list[Cell]) -> None:
                 cell.spec.judge(cell, SHUTDOWN, ended)
             if above is not None:
                 tell_ended_with(cell, above.path)
-            lifecycle.retire(cell, "its parent has stopped")
+            lifecycle.retire_with_parent(cell)
     finally:
         for timer in timers:
             timer.cancel()

@@ -15,7 +15,7 @@ from typing import Any
 from ..actors.errors import HoldfastError
 from ..actors.kernel import lifecycle, mailbox
 from ..actors.kernel.context import ActorContext
-from ..actors.kernel.envelope import LEAVE, Ask, Envelope, Item, ReplyHandle
+from ..actors.kernel.envelope import LEAVE, Ask, AskHandle, Envelope, Item, ReplyHandle
 from ..actors.kernel.message import Refusal
 from .admin import StartChild
 
@@ -91,10 +91,11 @@ async def answered(ctx: ActorContext, handle: ReplyHandle[Any], work: Coroutine[
     try:
         reply = await work
     except Refusal as no:
-        if handle.ask is None:
+        ask = handle.ask if isinstance(handle, AskHandle) else None
+        if ask is None:
             ctx._cell.node.refused(ctx._cell, item, no)
         else:
-            handle.ask.fail(no)
+            ask.fail(no)
     except HoldfastError as error:
         handle.fail(error)
     else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 from typing import Any
 
 from ..actors.errors import HoldfastError
@@ -56,11 +57,12 @@ class Inquiries(Actor):
 
     @on(CountChildren, readonly=True)
     def _count_children(self, message: CountChildren) -> ChildCounts:
-        """Count the children: all, those that run, supervisors and workers."""
+        """Count the children: all, those that run, supervisors and workers, and those that wait for somebody."""
         children = self._children.values()
         supervisors = sum(one.spec.is_supervisor for one in children)
         active = sum(one.is_running for one in children)
-        return ChildCounts(len(children), active, supervisors, len(children) - supervisors)
+        awaited = Counter(one.awaited for one in children if one.awaited)
+        return ChildCounts(len(children), active, supervisors, len(children) - supervisors, dict(awaited))
 
     @on(GetChildSpec, readonly=True)
     def _get_child_spec(self, message: GetChildSpec) -> Any:

@@ -32,7 +32,7 @@ from .admin import (
     TerminateChild,
     opened,
 )
-from .awaited import LOOK_AGAIN, Prospects
+from .awaited import LOOK_AGAIN, Prospects, tell_wait
 from .children import (
     RECOVERING,
     RESTARTING,
@@ -45,6 +45,7 @@ from .children import (
     StartLimit,
     StartRow,
     begin_start,
+    bind_expected,
     complete,
     new_cell,
     tell_ended_with,
@@ -53,7 +54,7 @@ from .children import (
 from .decisions import affected, decide, is_reported
 from .errands import Errand, answered
 from .inquiries import Inquiries
-from .intensity import admit_restart, recent_restarts
+from .intensity import CountedCauses, admit_restart, recent_restarts
 from .spec import ChildSpec, Flags, Plan, check_spec
 from .supervisor_changes import (
     Bequest,
@@ -88,6 +89,7 @@ class Supervisor(Inquiries):
     _template: ChildSpec | None = None  # of children that are started by their arguments
     _flags: Flags
     _restarts: tuple[float, ...]
+    _causes: CountedCauses
     _planned: frozenset[str]
     _parked: set[str]
     _dismissed: dict[str, None]
@@ -158,7 +160,7 @@ class Supervisor(Inquiries):
         self._children = {spec.id: Child(spec) for spec in plan.children}
         self._planned, self._parked = frozenset(self._children), set[str]()
         self._dismissed, self._ended = {}, {}
-        self._restarts = ()
+        self._restarts, self._causes = (), CountedCauses()
         self._early: list[lifecycle.ChildExit] = []
 
     def _is_starting(self) -> bool:
@@ -250,12 +252,15 @@ class Supervisor(Inquiries):
         Raises:
             StartFailed: they cannot come, or have not come within the time that the start may take.
         """
-        if one.cell is not None and one.cell.state is not GONE:
+        if one.cell is not None and one.cell.state is not GONE and not one.comes:
             return  # It has been bound: the address is there since.
         loop, who, seconds = self.ctx._cell.node.loop, self._path_of(one), one.spec.start_timeout or "infinity"
-        prospects, since = Prospects(self.ctx._cell.node, listed_at), loop.time()
+        prospects, since, told = Prospects(self.ctx._cell.node, listed_at), loop.time(), False
         try:
             while one.row is row and (missing := prospects.missing(who, one)):
+                if not told:
+                    tell_wait(self.ctx._cell)
+                    told = True
                 if not isinstance(seconds, str) and loop.time() - since >= seconds:
                     raise StartFailed(who, f"{missing}, to which it is bound, was not there within {seconds:g} s")
                 await asyncio.sleep(LOOK_AGAIN)
@@ -314,6 +319,9 @@ class Supervisor(Inquiries):
         if cell is None or cell.state is GONE:
             cell = one.cell = new_cell(self.ctx._cell, one)
             one.ignored_life = 0  # A new address counts its lives anew.
+            one.comes = False
+        elif one.comes:
+            bind_expected(self.ctx._cell, one, cell)
         return cell
 
     async def _take_name(self, one: Child, name: GivenName) -> None:
@@ -340,6 +348,8 @@ class Supervisor(Inquiries):
     def _start_failed(self, one: Child, error: HoldfastError) -> None:
         one.state, one.row = STOPPED, None
         if one.cell is not None:
+            if one.cell.life > one.ignored_life and isinstance(error, StartFailed):  # A life was begun, and has ended.
+                error.struck_by = error.struck_by or one.cell.extra().reason.common_cause
             one.ignored_life = one.cell.life
         node = self.ctx._cell.node
         if node.events.has_listeners:
@@ -485,12 +495,14 @@ class Supervisor(Inquiries):
         """One attempt by the strategy, counted; gives up when there were too many."""
         node, flags = self.ctx._cell.node, self._flags
         now, intensity, period = node.loop.time(), flags.intensity, flags.period
-        window = admit_restart(self._restarts, now, intensity=intensity, period=period)
+        window: tuple[float, ...] | None = recent_restarts(self._restarts, now, period)
+        if not self._causes.is_counted(reason.common_cause, one.spec.id, now, period):
+            window = admit_restart(self._restarts, now, intensity=intensity, period=period)
         own = admit_restart(one.restarts, now - one.away, intensity=intensity, period=period)
         if window is None or own is None:
             slow = "" if window is None else f", not counting the {one.away:.0f} s that restarts have taken"
             why = f"restart intensity reached{slow}; the last to end was {self._path_of(one)}: {reason}"
-            self._give_up(one, reason, Shutdown(why))
+            self._give_up(one, reason, Shutdown(why, reason.common_cause))
             return
         self._restarts, one.restarts = window, own
         if one.spec.is_supervisor:  # Perhaps it has ended because of somebody below it: that one comes back as it says.
@@ -498,7 +510,7 @@ class Supervisor(Inquiries):
         if node.events.has_listeners:
             node.emit(ChildRestarted(self._path_of(one), reason, len(window), flags.intensity))
         order = list(self._children.values())
-        group = affected(flags.strategy, order, order.index(one))
+        group = affected(flags.strategy, order, order.index(self._first_struck(one, reason)))
         wanted = [
             other
             for other in group
@@ -506,13 +518,21 @@ class Supervisor(Inquiries):
         ]
         self._errand(self._restart_group(one, wanted, now))
 
+    def _first_struck(self, one: Child, reason: ExitReason) -> Child:
+        """The first of the children that are restarted because of what has ended this one: one restart is for all."""
+        cause = reason.common_cause
+        if not cause or self._flags.strategy == "one_for_one":
+            return one
+        return next(other for other in self._children.values() if other is one or _has_ended_by(other, cause))
+
     def _give_up(self, one: Child, reason: ExitReason, told: ExitReason) -> None:
         """We end: too many restarts, or a rule says that this end is one for whoever is above us."""
         one.state = STOPPED
-        self._blame(one, str(reason))
+        if not reason.common_cause:
+            self._blame(one, str(reason))
         node = self.ctx._cell.node
-        node.gave_up = SupervisorGaveUp(self.ctx.path, one.spec.id, reason)
-        node.emit(node.gave_up)
+        node.supervised.gave_up = SupervisorGaveUp(self.ctx.path, one.spec.id, reason)
+        node.emit(node.supervised.gave_up)
         self.ctx.stop(told)
 
     def _blame(self, one: Child, why: str) -> None:
@@ -921,6 +941,14 @@ class Supervisor(Inquiries):
     def _specs(self) -> tuple[ChildSpec, ...]:
         """The specs as they are now."""
         return tuple(one.spec for one in self._children.values())
+
+
+def _has_ended_by(one: Child, cause: str) -> bool:
+    """Whether a child has ended by a common cause, and is to be restarted at once."""
+    if one.state != UP or one.cell is None or one.cell.state is not DOWN:
+        return False
+    reason, spec = one.cell.extra().reason, one.spec
+    return reason.common_cause == cause and spec.backoff is None and spec.restarts(reason)
 
 
 def listed_at(cell: Cell) -> dict[str, Child] | None:

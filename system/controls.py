@@ -40,6 +40,7 @@ from ..actors.kernel.actor import Actor, Start
 from ..actors.kernel.cell import Cell
 from ..actors.kernel.node import cell_kind
 from ..actors.kernel.ref import DEFAULT_TIMEOUT, Target
+from ..actors.process.grants import check_orders
 from ..actors.process.process_host import WorkerPlace
 from ..actors.process.resource_limits import Limits
 from ..actors.process.wire.peer import OutsideHost
@@ -64,12 +65,17 @@ if TYPE_CHECKING:
 A = TypeVar("A", bound=Actor)
 
 
+STATUS_WITHIN = 1.0
+"""Seconds in which an actor says what it is at."""
+
+
 class Controls:
     """Control of live actors: tasks, processes, actors of a subtree in a process, recorded or not.
 
     Who is meant is said by a ref or an address. Each call raises ActorStopped if nobody lives there any more, and
     NoSuchActor if nobody is found at an address, AskTimeout if the actor does not come to it within `timeout`
-    seconds (it is carried out between two turns), and SpecError if that is no finite number > 0. While an actor is
+    seconds (it is carried out between two turns, and the error's `turn` says which one is in the way), and
+    SpecError if that is no finite number > 0. While an actor is
     restarted, its next life is waited for.
     """
 
@@ -174,6 +180,13 @@ class Controls:
                 cell.more.tap.attach()
             respec(cell, start)
 
+    async def _turn_in_hand(self, target: Target) -> str:
+        """The turn that an actor is in, for how long it has been, and where it waits, in words; "" if none is known."""
+        try:
+            return said_of_turn(await self.get_status(target, timeout=STATUS_WITHIN))
+        except HoldfastError:
+            return ""
+
     async def get_status(self, target: Target, *, timeout: float = DEFAULT_TIMEOUT) -> Status:
         """How an actor is, also while a turn of it waits for something, and between two lives."""
         cell = self._living(target)
@@ -187,7 +200,7 @@ class Controls:
         if isinstance(host, OutsideHost):
             return known_at_home(cast("Status", await ask_status(host.peer, cell, timeout)), cell)
         if not has_process(cell):
-            return status_of(cell)
+            return await self._of_leader(cell, timeout)
         own, worker = status_of(cell), host.place.process(cell)
         if worker is None:
             return dataclasses.replace(own, pid=0)
@@ -201,6 +214,19 @@ class Controls:
             links=own.links,
             monitors=own.monitors,
         )
+
+    async def _of_leader(self, cell: Cell, timeout: float) -> Status:
+        """The status of an actor that no process beside this one has alone; with the turn of the replica that leads."""
+        own, place = status_of(cell), cell.host.place
+        worker = place.process(cell)
+        if worker is None or not cell.host.work(cell).is_in_turn:
+            return own
+        try:
+            there = await ask_status(worker, cell, min(timeout, STATUS_WITHIN), place.known_as(cell))
+        except (ActorStopped, AskFailed, AskTimeout):  # Another one leads soon.
+            return own
+        names = ("turn", "turn_seconds", "turn_at", "turn_rests")
+        return dataclasses.replace(own, **{name: getattr(there, name) for name in names})
 
     async def protection(self, target: Target, *, timeout: float = DEFAULT_TIMEOUT) -> ProtectionStatus:
         """Whether an actor is protected by mechanisms now, by which, who leads, and whether a replica may die.
@@ -236,7 +262,8 @@ class Controls:
     async def trace(self, target: Target, *, timeout: float = DEFAULT_TIMEOUT) -> EventStream:
         """Follow an actor: a stream of MessageIn, TurnBegan, TurnEnded and MessageOut. Close it when done.
 
-        It goes on over restarts and ends when the address is given up.
+        It goes on over restarts and ends when the address is given up. Of a turn that is in hand what it sends is
+        shown, and not its end.
         """
         cell = self._living(target)
         tap = tap_of(cell)
@@ -280,6 +307,8 @@ class Controls:
         cell = self._living(target)
         kind = cell_kind(cell)
         if kind is None or not issubclass(kind, Supervisor):
+            if isolation == "process":
+                check_orders(cell)
             await self._moves.move(cell, isolation, limits, timeout)
             return
         try:
@@ -312,7 +341,7 @@ class Controls:
         done, _ = await asyncio.wait((gone,), timeout=timeout)
         if not done:
             gone.cancel()
-            raise StillEnding(cell.path, timeout)
+            raise await self._busy(cell, StillEnding(cell.path, timeout))
         return gone.result()
 
     # -- how --------------------------------------------------------------------------------------------------------
@@ -342,7 +371,7 @@ class Controls:
         done, _ = await asyncio.wait([wish], timeout=timeout)
         if not done:
             wish.cancel()
-            raise AskTimeout(cell.path, timeout, None)
+            raise await self._busy(cell, AskTimeout(cell.path, timeout, None))
         wish.result()
 
     async def _replace(self, target: Target, wanted: Order, timeout: float) -> Any:
@@ -359,7 +388,23 @@ class Controls:
         return result
 
     async def _order(self, target: Target, wanted: Order, timeout: float) -> Any:
-        return await self._moves.given(self._node.meant(target), wanted, timeout)
+        cell = self._node.meant(target)
+        try:
+            return await self._moves.given(cell, wanted, timeout)
+        except AskTimeout as late:
+            raise await self._busy(cell, late) from late
+
+    async def _busy(self, cell: Cell, late: AskTimeout) -> AskTimeout:
+        """The same error; it says which turn is in the way, and since when, if that is known."""
+        return type(late)(late.actor, late.seconds, late.handled, late.why, await self._turn_in_hand(cell.ref))
+
+
+def said_of_turn(status: Status) -> str:
+    """The turn that an actor is in, for how long it has been, and the line at which it waits; "" if it is in none."""
+    if not status.turn:
+        return ""
+    at = f" (at {status.turn_at})" if status.turn_at else ""
+    return f"its turn of {status.turn} has run for {status.turn_seconds:.0f} s{at}"
 
 
 def has_process(cell: Cell) -> bool:

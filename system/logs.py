@@ -14,6 +14,7 @@ from ..actors.events import (
     ActorCrashed,
     AutoShutdown,
     BindingAwaited,
+    ChildRestarted,
     ChildStartFailed,
     ChildTerminated,
     ConnectionLimited,
@@ -57,6 +58,7 @@ from ..actors.events import (
     TrustBreached,
     TurnsLost,
     TurnSlow,
+    TurnWaits,
 )
 from ..actors.exit_reasons import Crash
 from ..actors.kernel.envelope import Item, item_name
@@ -84,6 +86,7 @@ from ..ftm.events import (
 from .history.writer import HistoryNotKept
 from .last_lines.line_memory import LineLevel, LineMemory
 from .mechanism_notes import AdaptationUndone
+from .recovered import Recoveries
 from .specification import SpecificationNotKept
 from .transaction.events import ScriptLoaded, TransactionCommitted, TransactionRolledBack
 
@@ -117,7 +120,8 @@ class LogSink:
     """Writes what an operator wants to see; formats only what is written.
 
     A crash is told by several events: the actor's, that of its process, and its supervisor's; a recovery that fails by
-    its own and its supervisor's. The record waits for the last of them, at most `WAIT` seconds.
+    its own and its supervisor's. The record waits for the last of them, at most `WAIT` seconds. Of actors that recover
+    together there is one record.
 
     Args:
         system: the system's name.
@@ -137,6 +141,7 @@ class LogSink:
         self._lines = lines
         self._second: dict[type, tuple[int, int]] = {}
         self._crashes: dict[str, tuple[Event, asyncio.TimerHandle]] = {}  # by address: what waits for its supervisor
+        self._recoveries = Recoveries(loop, self._write_recovered)
         self._letters: dict[tuple[str, type, str], tuple[float, int]] = {}  # when one was told, and how many not since
 
     def __call__(self, event: Event) -> None:
@@ -157,6 +162,13 @@ class LogSink:
                 self._write_start(event, self._crash_at(event.address))
             case DeadLetter():
                 self._write_letter(event)
+            case LogLine():
+                if event.is_logged:
+                    self._write(event)
+            case ChildRestarted():
+                self._recoveries.restarted(event.address)
+            case Recovered():
+                self._recoveries.add(event)
             case _ if type(event) in WRITTEN:
                 self._write(event)
             case _:
@@ -166,6 +178,7 @@ class LogSink:
         """Write the events that still wait."""
         for address in list(self._crashes):
             self._release(address)
+        self._recoveries.close()
 
     # -- crashes ----------------------------------------------------------------------------------------------------
 
@@ -218,15 +231,35 @@ class LogSink:
             crash = None
         self._write(event, **({} if crash is None else self._describe(crash)))
 
+    # -- recoveries -------------------------------------------------------------------------------------------------
+
+    def _write_recovered(self, above: str, recovered: list[Recovered]) -> None:
+        """Tell of what has recovered below an address."""
+        if len(recovered) == 1:
+            self._write(recovered[0])
+            return
+        slowest = max(recovered, key=_seconds)
+        fields: Fields = {
+            "address": above,
+            "actors": len(recovered),
+            "replayed": sum(one.replayed for one in recovered),
+            "slowest": slowest.address,
+            "seconds": round(_seconds(slowest), 6),
+        }
+        self._record(Recovered, "actors recovered", fields)
+
     # -- records ----------------------------------------------------------------------------------------------------
 
     def _write(self, event: Event, **more: object) -> None:
         kind = type(event)
+        self._record(kind, WRITTEN[kind][1], {**self._describe(event), **more})
+
+    def _record(self, kind: type[Event], name: str, said: Fields) -> None:
         left_out = 0 if kind is LogLine else self._admit(kind)
         if left_out is None:
             return
-        level, name = WRITTEN[kind]
-        fields: Fields = {**self._describe(event), **more, "system": self._system}
+        level, fields = WRITTEN[kind][0], {**said, "system": self._system}
+        fields.pop("is_logged", None)
         if kind is not LogLine:  # What a program prints is its own affair.
             fields = {key: one.translate(SHOWN) if isinstance(one, str) else one for key, one in fields.items()}
         if left_out:
@@ -234,7 +267,7 @@ class LogSink:
         if self._lines is not None and kind is not LogLine:
             own = {key: one for key, one in fields.items() if key not in TOLD_APART}
             life = fields.get("life", 0)
-            self._lines.add(event.address, "holdfast", LEVEL_NAMES[level], record_text(name, own), int(life))
+            self._lines.add(fields["address"], "holdfast", LEVEL_NAMES[level], record_text(name, own), int(life))
         structlog = _structlog()
         if structlog is None:
             _write_standard(level, name, fields)
@@ -309,6 +342,7 @@ WRITTEN: dict[type, tuple[int, str]] = {
     SpecificationNotKept: (logging.ERROR, "specification not kept"),
     LoopLagged: (logging.WARNING, "loop lagged"),
     TurnSlow: (logging.WARNING, "turn slow"),
+    TurnWaits: (logging.WARNING, "turn waits"),
     AdaptationUndone: (logging.WARNING, "adaptation undone"),
     BackgroundWorkLost: (logging.ERROR, "background work lost"),
     Diverged: (logging.ERROR, "replica diverged"),
@@ -359,6 +393,11 @@ def describe(event: Event, *, payloads: bool = False) -> Fields:
         else:
             fields[name] = str(value)
     return fields
+
+
+def _seconds(recovered: Recovered) -> float:
+    """How long a recovery has taken."""
+    return sum(recovered.phases.values())
 
 
 def record_text(name: str, fields: Fields) -> str:

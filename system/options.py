@@ -58,6 +58,7 @@ class SystemOptions:
     takeover: bool
     watch_lag: float | None
     watch_turns: float | None
+    watch_waits: float | None
     recovery_hooks: RecoveryHooks | None
     recovery: str | os.PathLike[str] | RecoveryFile | None
 
@@ -79,7 +80,7 @@ class SystemOptions:
         hooks = self.recovery_hooks
         if hooks is not None and not isinstance(hooks, RecoveryHooks):
             raise SpecError("ActorSystem", f"recovery_hooks must come from recovery_hooks(...), not be {hooks!r}")
-        check_limits(self.watch_lag, self.watch_turns)
+        check_limits(watch_lag=self.watch_lag, watch_turns=self.watch_turns, watch_waits=self.watch_waits)
 
     @property
     def reached_at(self) -> str | Servers | None:

@@ -26,7 +26,7 @@ from ..supervision.awaited import not_there
 from ..supervision.children import Child
 from ..supervision.respec import rebuilt
 from ..supervision.spec import ChildSpec, Flags
-from ..supervision.supervisor import Supervisor
+from ..supervision.supervisor import Supervisor, listed_at
 from .script import find_only_here
 
 if TYPE_CHECKING:
@@ -191,7 +191,7 @@ class Specifications:
                 del self._loaded[address]  # It stays in the store: its class may come back.
                 node.emit(SpecificationNotKept(address, str(error)))
                 continue
-            if not not_there(node, address, spec):
+            if not not_there(node, listed_at, address, spec):
                 del self._loaded[address]
                 self._added.add(address)
                 self.brought.add(address)

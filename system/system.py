@@ -11,6 +11,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, TypeVar, cast, get_args, overload
 
 from ..actors.control.drain import drain as drain_queue
+from ..actors.control.wait_watch import WaitWatch
 from ..actors.errors import ActorStopped, HoldfastError, NoSuchActor, SpecError, StoreError, TreeFailed
 from ..actors.events import EventStream, LeadershipTaken, RecoveryTableUnused, ServersAnswer, ServersSilent, StandingBy
 from ..actors.exit_reasons import SHUTDOWN, ExitReason, Shutdown, pack_exit
@@ -51,6 +52,7 @@ from ..cluster.silence import SilenceOfServers
 from ..supervision.admin import NoSuchChild, RemoveChild, StartChild
 from ..supervision.children import tell_stopped
 from ..supervision.patience import end_within, told_if_held
+from ..supervision.repeatable import bears_repetition
 from ..supervision.respec import respec
 from ..supervision.spec import ChildSpec, Flags
 from ..supervision.supervisor import Supervisor, kill_starting
@@ -122,6 +124,8 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
         watch_lag: tell (LoopLagged) when this process's event loop comes later than this many seconds.
         watch_turns: tell (TurnSlow) of turns in this process that occupy the loop for longer than this many seconds.
             For actors in processes see `Limits(hung_after=...)`.
+        watch_waits: tell (TurnWaits) of turns, wherever they run, that take longer than this many seconds with all that
+            they wait for. Nothing is ended.
         recovery_hooks: `recovery_hooks(...)`: what is called before and after the phases of every recovery.
         recovery: a recovery file (its path, or from `load_recovery`): how actors are recovered whose child specs do
             not say, and their key variables.
@@ -151,6 +155,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
         takeover: bool = False,
         watch_lag: float | None = None,
         watch_turns: float | None = None,
+        watch_waits: float | None = None,
         recovery_hooks: RecoveryHooks | None = None,
         recovery: str | os.PathLike[str] | RecoveryFile | None = None,
     ) -> None:
@@ -173,6 +178,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
             takeover=takeover,
             watch_lag=watch_lag,
             watch_turns=watch_turns,
+            watch_waits=watch_waits,
             recovery_hooks=recovery_hooks,
             recovery=recovery,
         )
@@ -242,7 +248,14 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
             raise
         try:
             check_system(engine, self.name)
-            self._homes = Homes(node, engine, durability=options.durability, file=file, hooks=options.recovery_hooks)
+            self._homes = Homes(
+                node,
+                engine,
+                durability=options.durability,
+                file=file,
+                hooks=options.recovery_hooks,
+                bears_repetition=bears_repetition,
+            )
             self._specifications = Specifications(self._homes, is_kept=options.store is not None)
             self._mechanism_notes = MechanismNotes(self._homes)
             epoch = engine.epoch if engine.safe_at == "sync" else None
@@ -265,8 +278,12 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
         if file is not None:
             self._patience = node.loop.call_later(PATIENCE, self._tell_unused)
         self._moves = Moves(node)
-        self._watch = LoopWatch(node, options.watch_lag, options.watch_turns)
-        self._watch.open()
+        self._watches = (
+            LoopWatch(node, options.watch_lag, options.watch_turns),
+            WaitWatch(node, options.watch_waits, self._status),
+        )
+        for watch in self._watches:
+            watch.open()
         node.connect(
             Ports(
                 host_for=self._host_for,
@@ -434,7 +451,8 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
         await self._moves.close()
         while node.remains:
             await asyncio.wait(set(node.remains))
-        self._watch.close()
+        for watch in self._watches:
+            watch.close()
         if node.cell_kinds.watcher is not None:
             self.trace_with(None)
         await self._workers.close()
@@ -536,7 +554,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
         """The root supervisor is gone: if nobody asked for that, the body must hear of it."""
         if self._closing is not None or done.cancelled():
             return
-        reason, last = done.result(), self._node.gave_up
+        reason, last = done.result(), self._node.supervised.gave_up
         if isinstance(reason, Shutdown) and reason.detail:
             why = reason.detail
         else:
@@ -651,10 +669,11 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
     def ref(self, path: str, kind: type[Actor] = Actor) -> ActorRef[Any]:
         """Return a ref to the actor at an address; `kind` is its class, or a base of it, if you want the ref typed.
 
-        Between two lives of a child the address is there, and what is sent waits.
+        Between two lives of a child the address is there, and what is sent waits; so it is before the first life of one
+        that comes back with its dynamic supervisor.
 
         Raises:
-            NoSuchActor: nobody lives there, or its supervisor is between two lives itself.
+            NoSuchActor: nobody lives there nor is about to, or its supervisor is between two lives itself.
             WrongActor: another class does.
         """
         return self._node.find_ref(path, kind)

@@ -17,7 +17,7 @@ import msgspec
 from ..actors.errors import HoldfastError
 from ..actors.kernel.loop import RunLoop
 from ..actors.kernel.message import message_of
-from ..actors.kernel.timers import Timer
+from ..actors.kernel.timers import LoopTimer
 from ..actors.process.process_host import Outlet
 from ..actors.process.wire import frames
 from ..actors.process.worker_pool import Worker
@@ -143,7 +143,7 @@ def movers(handles: Iterable[asyncio.Handle]) -> list[str]:
         match owner := getattr(callback, "__self__", None):
             case RunLoop():
                 found.update(dict.fromkeys(map(_told, owner.ready)))
-            case Timer(message=message):
+            case LoopTimer(message=message):
                 found[f"{owner._cell.path} (timer of {type(message).__name__})"] = None
             case asyncio.Task():
                 found[owner.get_name()] = None

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeGuard
 
 from ..actors.errors import HoldfastError
 from ..actors.events import ActorCrashed, DeadLetter, Event, HookFailed, LifeAbandoned, ProcessDied
-from ..actors.exit_reasons import Exited, Hung, OutOfMemory, Signal, TrustBreach
+from ..actors.exit_reasons import Exited, ForkServerDied, Hung, OutOfMemory, Signal, TrustBreach
 from ..actors.kernel.address_host import AddressHost
 from ..actors.kernel.envelope import message_in
 from ..actors.kernel.node import Node
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from .schedules.control import ControlledLoop
 
 CRASHES = (ActorCrashed, HookFailed, LifeAbandoned)
-DEATHS = (Signal, Exited, OutOfMemory, Hung, TrustBreach)
+DEATHS = (Signal, ForkServerDied, Exited, OutOfMemory, Hung, TrustBreach)
 SHOWN = 20
 """Problems of one kind that are told in full."""
 

@@ -16,7 +16,7 @@ from ..actors.exit_reasons import ExitReason
 from ..actors.kernel import links
 from ..actors.kernel.actor import Actor, Start
 from ..actors.kernel.cell import Cell
-from ..actors.kernel.envelope import Ask, Envelope, Handler, Item, ReplyHandle, Table, message_in
+from ..actors.kernel.envelope import Ask, AskHandle, Envelope, Handler, Item, ReplyHandle, Table, message_in
 from ..actors.kernel.links import Monitor
 from ..actors.kernel.message import Message, Refusal, reply_type
 from ..actors.kernel.ref import DEFAULT_TIMEOUT, ActorRef, current
@@ -438,7 +438,7 @@ class Probe:
         cell: Cell = to._cell
         cell.require(last.message)
         self._answered = True
-        ask = None if last.handle is None else last.handle.ask
+        ask = last.handle.ask if isinstance(last.handle, AskHandle) else None
         if ask is not None:
             cell.admit(cell, ask)
         elif last.sender is not None:

@@ -36,6 +36,8 @@ class Order:
     """Base of all orders, which an actor obeys ahead of its messages."""
 
     verb: ClassVar[str]
+    is_beside: ClassVar[bool] = False
+    """Whether it is obeyed in the middle of a turn that waits, too."""
 
     def run(self, cell: Cell, actor: Actor) -> Any:
         """Carry it out; raises ControlFailed."""
@@ -361,6 +363,7 @@ class ObserveTurns(Order):
     """Count (`statistics`) and follow (`trace`) what the actor does, or do not any more; returns the counts."""
 
     verb: ClassVar[str] = "look"
+    is_beside: ClassVar[bool] = True
     counting: bool | None  # None: as it is
     tracing: bool | None
 

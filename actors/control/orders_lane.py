@@ -99,6 +99,13 @@ class QueuedOrder(Item):
         """Whether it goes ahead of the messages."""
         return type(self.order) is not Mark
 
+    def runs_beside(self, cell: Cell) -> bool:
+        """Whether it was obeyed just now, beside the turn that waits."""
+        if not self.order.is_beside or cell.actor is None or cell.more is None or cell.more.turn is None:
+            return False
+        QueuedOrder.run(cell.actor, self)
+        return True
+
 
 def answer_bytes(value: object, path: str, verb: str) -> bytes:
     """What an order gives, as bytes that fit into one frame.
@@ -187,9 +194,9 @@ def take_orders(peer: Peer, cell: Cell | None = None) -> list[QueuedOrder]:
     return [ask.call for ask in waiting]
 
 
-def ask_status(peer: Peer, cell: Cell, timeout: float) -> asyncio.Future[Any]:
-    """The status that the process of an actor gives of it."""
-    return _ask_beside(peer, cell, "status", timeout)
+def ask_status(peer: Peer, cell: Cell, timeout: float, path: str = "") -> asyncio.Future[Any]:
+    """The status that the process of an actor gives of it, as it knows it at `path`, which may be another address."""
+    return _ask_beside(peer, cell, "status", timeout, path)
 
 
 def ask_turns(peer: Peer, cell: Cell, timeout: float) -> asyncio.Future[Any]:
@@ -197,13 +204,13 @@ def ask_turns(peer: Peer, cell: Cell, timeout: float) -> asyncio.Future[Any]:
     return _ask_beside(peer, cell, "turns", timeout)
 
 
-def _ask_beside(peer: Peer, cell: Cell, verb: str, timeout: float) -> asyncio.Future[Any]:
+def _ask_beside(peer: Peer, cell: Cell, verb: str, timeout: float, path: str = "") -> asyncio.Future[Any]:
     """Ask what the process of an actor tells at once, also while a turn waits."""
     node = cell.node
     future: asyncio.Future[Any] = node.loop.create_future()
     ask = OrderAsk(ORDERED, None, (), timeout, NO_DEADLINE, future, cell)
     node.deadlines.add(ask)
-    _send(peer, cell.path, ask, verb, encode_value({}))
+    _send(peer, path or cell.path, ask, verb, encode_value({}))
     return future
 
 

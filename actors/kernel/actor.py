@@ -13,10 +13,10 @@ import msgspec
 from ..errors import type_name
 from ..safe_state import SafeStateChange, watch
 from ..seconds import is_seconds
-from .bindings import Binding
+from .bindings import Binding, noting
 from .blocking_handlers import in_thread
 from .envelope import Table
-from .message import Message
+from .message import Message, RuntimeOrder
 
 if TYPE_CHECKING:
     from ..exit_reasons import ExitReason
@@ -186,7 +186,8 @@ class Actor:
                     _check(cls, name, handler, handles.kind)  # Else it was when the base was made; this is slow.
                 if handles.kind in table:
                     raise TypeError(f"{type_name(cls)} has two handlers for {type_name(handles.kind)}: see {name}")
-                table[handles.kind] = in_thread(handler) if handles.to_thread else handler
+                turn = in_thread(handler) if handles.to_thread else handler
+                table[handles.kind] = noting(turn) if issubclass(handles.kind, RuntimeOrder) else turn
                 declared[handles.kind] = handles
             if subscribed and not marks:
                 raise TypeError(f"{type_name(cls)}.{name} has @subscribe without @on: nothing would ever reach it")

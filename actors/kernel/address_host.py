@@ -68,6 +68,9 @@ class Home:
         cell.admit(cell, item)
         return None
 
+    def expect(self, cell: Cell) -> None:
+        """The address was made ahead of its first life in this program: what is sent there waits for that."""
+
     def is_open(self, cell: Cell) -> bool:
         """Whether it lets messages through to the life at the address."""
         return True
@@ -213,6 +216,10 @@ class Place:
     def process(self, cell: Cell) -> Any:
         """The process besides this one that the present life is lived in, if there is one now."""
         return None
+
+    def known_as(self, cell: Cell) -> str:
+        """The address by which that process knows who lives that life."""
+        return cell.path
 
     def replica_states(self) -> Mapping[str, str] | None:
         """How each replica that lives the life here does: "leads", "follows", "joining", "silent" or "down".

@@ -1,16 +1,19 @@
-"""Bindings: named ports of an actor that the runtime can point elsewhere."""
+"""Bindings: named ports of an actor that the runtime can point elsewhere; and whom an actor has given orders."""
 
 from __future__ import annotations
 
+import functools
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast, overload
 
 from ..errors import HoldfastError
+from .envelope import Item
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     from .actor import Actor
     from .cell import Cell
+    from .message import Message
     from .ref import ActorRef
 
 A_co = TypeVar("A_co", bound="Actor", covariant=True)
@@ -95,3 +98,34 @@ def unclaimed(cell: Cell) -> dict[str, Cell]:
     """The bindings that were made here, which grant what they lead to."""
     more = cell.more
     return {} if more is None else {port: to for port, to in more.bindings.items() if port not in more.claimed}
+
+
+# -- whom an actor has ordered: from another process it may order those alone whom a binding grants ------------------
+
+MOST_ORDERED: int = 64
+"""Addresses that are noted of one actor; further ones are not."""
+
+
+def note_order(giver: Cell, to: Cell) -> None:
+    """Note that an actor has given an order to another one."""
+    known = giver.extra().ordered
+    if len(known) < MOST_ORDERED:
+        known[to.path] = None
+
+
+def ordered_by(giver: Cell) -> list[str]:
+    """The addresses to which an actor has given orders since the system has begun, as far as this process knows."""
+    return [] if giver.more is None or not giver.more.has_more else list(giver.more.ordered)
+
+
+def noting(handler: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+    """The handler of an order, which notes who has given it."""
+
+    @functools.wraps(handler)
+    def turn(actor: Actor, message: Message[Any]) -> Any:
+        item = actor.ctx._item
+        if isinstance(item, Item) and item.sender is not None:
+            note_order(item.sender, actor.ctx._cell)
+        return handler(actor, message)
+
+    return turn

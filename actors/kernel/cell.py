@@ -247,6 +247,7 @@ class More:
         "enders",
         "has_more",
         "last",
+        "ordered",
         "outlet",
         "reason",
         "start",
@@ -264,6 +265,7 @@ class More:
     belongings: Belongings
     bindings: dict[str, Cell]
     calls: list[QueuedOrder]  # control that waits for the actor's process to be up
+    ordered: dict[str, None]  # addresses to which it has given orders
     ties: Ties
 
     def __init__(self) -> None:
@@ -295,7 +297,13 @@ class More:
         return made
 
 
-_MADE_LATER: dict[str, Callable[[], Any]] = {"belongings": Belongings, "bindings": dict, "calls": list, "ties": Ties}
+_MADE_LATER: dict[str, Callable[[], Any]] = {
+    "belongings": Belongings,
+    "bindings": dict,
+    "calls": list,
+    "ordered": dict,
+    "ties": Ties,
+}
 
 
 class _Hot:

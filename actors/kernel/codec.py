@@ -30,6 +30,7 @@ from ..errors import (
 )
 from ..values.arrays import described_dtype
 from .cell import GONE
+from .envelope import ReplyHandle
 from .message import Message, Refusal, UnknownRefusal, find_refusal, message_name, reply_type
 from .ref import ActorRef
 
@@ -267,6 +268,8 @@ def encode_special(value: Any) -> Any:
             return msgspec.msgpack.Ext(ARRAY, encode_array(value))
         if isinstance(value, numpy.generic):
             return value.item()
+    if isinstance(value, ReplyHandle):
+        raise TypeError("a reply handle cannot be sent; have another actor answer with ctx.forward()")
     raise TypeError(f"a value of type {type_name(type(value))} cannot be sent")
 
 

@@ -24,6 +24,7 @@ from .cell import TurnRest
 from .envelope import (
     NO_DEADLINE,
     Ask,
+    AskHandle,
     Chain,
     Envelope,
     Item,
@@ -35,7 +36,7 @@ from .envelope import (
 )
 from .links import Monitor
 from .message import Message, reply_type, require_message
-from .timers import Timer
+from .timers import LoopTimer, Timer
 from .topics import NOT_TAKEN, publish
 
 if TYPE_CHECKING:
@@ -58,6 +59,9 @@ DRIVEN = "driven_turn"
 LONGEST: Final = 16
 """Turns in the longest circle that is looked for when an ask is made."""
 EXITS: Final = frozenset({"__exit__", "__aexit__"})
+
+
+NO_MESSAGE: Final = "only a message can be stashed, and what is in hand is none"
 
 
 class StashError(HoldfastError, text="{why}"):
@@ -246,7 +250,7 @@ class ActorContext:
     def reply_handle(self) -> ReplyHandle[Any]:
         """Return the right to answer the ask in hand later: `return self.ctx.reply_handle()`, keep it, call `reply`."""
         item = self._item
-        return self._promise(item) if isinstance(item, Ask) else ReplyHandle(None)
+        return self._promise(item) if isinstance(item, Ask) else AskHandle(None)
 
     def _promise(self, ask: Ask) -> ReplyHandle[Any]:
         """A reply handle for an ask, which is remembered while it waits."""
@@ -256,7 +260,7 @@ class ActorContext:
         elif len(promised) >= 64 and len(promised) & (len(promised) - 1) == 0:  # At each power of two.
             promised[:] = [one for one in promised if not one.is_done]
         promised.append(ask)
-        return ReplyHandle(ask)
+        return AskHandle(ask)
 
     def _promised(self) -> tuple[Ask, ...]:
         """The asks for which there are reply handles; those that are over may be among them."""
@@ -316,7 +320,7 @@ class ActorContext:
     def _timer(self, message: Message[Any], delay: float, interval: float | None) -> Any:
         """A handle on a timer that is set now."""
         self._alive()
-        return Timer(self._cell, message, delay, interval)
+        return LoopTimer(self._cell, message, delay, interval)
 
     def pipe_to_self(
         self,
@@ -538,13 +542,22 @@ class ActorContext:
     # -- stash ------------------------------------------------------------------------------------------------------
 
     def stash(self) -> None:
-        """Put the message in hand aside; it comes again after `unstash`. Its turn ends without a reply."""
+        """Put the message in hand aside; it comes again after `unstash`. Its turn ends without a reply.
+
+        What a timer, background work or a topic has brought is a message, too, and once it is put aside one like any
+        other: to cancel its timer takes nothing back, and what a repeated timer brings next comes as well.
+
+        Raises:
+            StashError: no message is in hand (but an EXIT, a DOWN, or the start), or this one was stashed already.
+        """
         self._alive()
         item = self._item
         if isinstance(item, Stashed):
             raise StashError(f"{self.path}: this message was stashed or forwarded already")
         if isinstance(item, Item) and item.of_life:
-            raise StashError(f"{self.path}: only a message can be stashed")
+            if item.message is None:
+                raise StashError(f"{self.path}: {NO_MESSAGE}")
+            item = item.message  # From now on it is one like any other.
         more = self._cell.extra()
         if more.stash is None:
             more.stash = deque()

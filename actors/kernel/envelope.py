@@ -242,7 +242,7 @@ class Ask(Item, msgspec.Struct, eq=False):
 
     def answer(self, reply: object) -> None:
         """Hand the reply to the asker; a late one is dropped and counted."""
-        if type(reply) is ReplyHandle:
+        if type(reply) is AskHandle:
             return  # The handler keeps the handle and answers later.
         if not self.future.done():
             self.future.set_result(reply)
@@ -305,7 +305,26 @@ async def _finish(cell: Cell, ask: Ask, handler: Coroutine[Any, Any, object]) ->
 
 
 class ReplyHandle(Generic[R]):
-    """The right to answer one ask later. `return self.ctx.reply_handle()` ends the turn without a reply."""
+    """The right to answer one ask later, from `ctx.reply_handle`, for the actor that was asked.
+
+    `return self.ctx.reply_handle()` ends the turn without a reply. The actor keeps the handle, in a key variable if it
+    has recovery, until it answers; a handle of an ask that is over does nothing. It cannot be sent from one process to
+    another, nor by an actor with recovery: `ctx.forward` has another actor answer.
+    """
+
+    __slots__ = ()
+
+    def reply(self, value: R) -> None:
+        """Answer with a value; a second answer and one after the deadline are dropped."""
+        raise NotImplementedError
+
+    def fail(self, error: HoldfastError) -> None:
+        """Answer with a Refusal, or another error of the library, which the asker's `await` raises."""
+        raise NotImplementedError
+
+
+class AskHandle(ReplyHandle[R]):
+    """The right to answer an ask of which this process has the asker's end."""
 
     __slots__ = ("_ask",)
 
@@ -314,15 +333,13 @@ class ReplyHandle(Generic[R]):
 
     @property
     def ask(self) -> Ask | None:
-        """Return the ask that is to be answered; None if nobody waits."""
+        """The ask that is to be answered; None if nobody waits."""
         return self._ask
 
     def reply(self, value: R) -> None:
-        """Answer; a second answer and one after the deadline are dropped."""
         if self._ask is not None:
             self._ask.answer(value)
 
     def fail(self, error: HoldfastError) -> None:
-        """Answer with a Refusal or another typed error."""
         if self._ask is not None:
             self._ask.fail(error)

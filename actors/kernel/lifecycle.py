@@ -85,6 +85,8 @@ class HerePlace(Place):
             cell.node.loop.call_soon(_strike, cell, cell.life)
 
     def control(self, cell: Cell, call: QueuedOrder) -> None:
+        if call.runs_beside(cell):
+            return
         if call.is_urgent:
             urge(cell, call)
         else:
@@ -461,6 +463,7 @@ class End:
 
 def _wind_down(cell: Cell, end: End, farewell: Any) -> None:
     cell.state = ENDING
+    cell.extra().reason = end.reason  # Those below it, which end with it, say why.
     cell.scheduled = True
     if cell.node.step(cell, None, farewell):
         ended(cell, end.reason)
@@ -658,6 +661,15 @@ def retire(cell: Cell, why: object) -> None:
             item.undelivered(cell, str(why))
         else:
             cell.undelivered(item, str(why))
+
+
+def retire_with_parent(cell: Cell) -> None:
+    """The address is given up, for the parent ends; who waits there is told why that is, if it is no mere stop."""
+    lives = [cell] if cell.state is DOWN else []
+    reasons = (one.more.reason for one in (cell.parent, *lives) if one is not None and one.more is not None)
+    reason = next((one for one in reasons if one not in (NORMAL, SHUTDOWN)), None)
+    said = "" if reason is None else f": {reason}"
+    retire(cell, f"its parent has stopped{said}")
 
 
 def disown(cell: Cell) -> None:

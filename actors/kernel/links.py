@@ -19,6 +19,19 @@ if TYPE_CHECKING:
 
 
 class Monitor:
+    """A handle on one watch over another actor, from `ctx.monitor` or `ctx.watch`, for the actor that watches.
+
+    An actor with recovery may keep it in its state.
+    """
+
+    __slots__ = ()
+
+    def cancel(self) -> None:
+        """Cancel the monitor: no DOWN arrives after this, not even one that is queued already."""
+        raise NotImplementedError
+
+
+class LifeMonitor(Monitor):
     """One watch of `target` by `watcher`."""
 
     __slots__ = ("active", "for_good", "life", "name", "target", "watcher")
@@ -30,7 +43,6 @@ class Monitor:
         self.life = watcher.life  # a watch ends with the life that set it
 
     def cancel(self) -> None:
-        """Cancel the monitor: no DOWN arrives after this, not even one that is queued already."""
         self.active = False
         target = self.target
         self.forget()
@@ -51,13 +63,13 @@ class Ties:
 
     def __init__(self) -> None:
         self.links: dict[Cell, str] = {}  # and the address that each is known by here, also if it has moved
-        self.monitors: list[Monitor] = []
-        self.watching: dict[Monitor, None] = {}
+        self.monitors: list[LifeMonitor] = []
+        self.watching: dict[LifeMonitor, None] = {}
 
 
-def monitor(watcher: Cell, target: Cell, *, for_good: bool, name: str = "") -> Monitor:
+def monitor(watcher: Cell, target: Cell, *, for_good: bool, name: str = "") -> LifeMonitor:
     """Start a watch; if nobody lives there, DOWN with NOPROC comes at once. `name`: the address that was given."""
-    watch = Monitor(watcher, target, for_good, name)
+    watch = LifeMonitor(watcher, target, for_good, name)
     if target.is_dead:
         watcher.push(Down(watch, NOPROC, recovering=False))
     else:
@@ -66,7 +78,7 @@ def monitor(watcher: Cell, target: Cell, *, for_good: bool, name: str = "") -> M
     return watch
 
 
-def has_missed(watch: Monitor) -> None:
+def has_missed(watch: LifeMonitor) -> None:
     """The life that was watched is over, though the actor lives: its watcher is told so now."""
     target = watch.target
     if watch.for_good or not watch.active or target.more is None or watch not in target.more.ties.monitors:
@@ -78,14 +90,14 @@ def has_missed(watch: Monitor) -> None:
     watch.watcher.push(Down(watch, reason, recovering))
 
 
-def note_watch(watch: Monitor) -> Monitor:
+def note_watch(watch: LifeMonitor) -> LifeMonitor:
     """Have a watch here that is kept on the other side of a border already: nobody is told of it."""
     watch.target.extra().ties.monitors.append(watch)
     watch.watcher.extra().ties.watching[watch] = None
     return watch
 
 
-def drop_watch(watch: Monitor) -> None:
+def drop_watch(watch: LifeMonitor) -> None:
     """A watch is kept on the other side of a border alone from now on: nobody is told of that."""
     watch.forget()
     watch.target.extra().ties.monitors.remove(watch)
@@ -178,7 +190,7 @@ def announce(cell: Cell, reason: ExitReason, *, recovering: bool) -> None:
     if not recovering:
         tell_linked(cell, reason)
     if ties.monitors:
-        stay: list[Monitor] = []
+        stay: list[LifeMonitor] = []
         for watch in ties.monitors:
             if watch.for_good:
                 stay.append(watch)
@@ -223,7 +235,7 @@ def down_arrived(
 
     One that is carried behind an actor that moves is told also if its watch is not known here: that was over before.
     """
-    monitors: list[Monitor] = target.more.ties.monitors if target.more is not None else []
+    monitors: list[LifeMonitor] = target.more.ties.monitors if target.more is not None else []
     for watch in monitors:
         if watch.watcher is watcher and watch.for_good is for_good:
             monitors.remove(watch)
@@ -234,7 +246,7 @@ def down_arrived(
             watcher.push(Down(watch, reason, recovering))
             return
     if is_carried:
-        watcher.push(Down(Monitor(watcher, target, for_good), reason, recovering))
+        watcher.push(Down(LifeMonitor(watcher, target, for_good), reason, recovering))
 
 
 class Exit(Item):
@@ -273,7 +285,7 @@ class Down(Item):
 
     __slots__ = ("is_carried", "reason", "recovering", "watch")
 
-    def __init__(self, watch: Monitor, reason: ExitReason, recovering: bool) -> None:
+    def __init__(self, watch: LifeMonitor, reason: ExitReason, recovering: bool) -> None:
         self.watch, self.reason, self.recovering = watch, reason, recovering
         self.is_carried = False  # as of an EXIT
 

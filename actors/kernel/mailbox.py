@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 from ..errors import MailboxFull
-from ..overflow import Overflow, check, decide
+from ..overflow import Overflow, check, decide, drop_reason
 from .envelope import LEAVE, Ask, Envelope, Item, message_in
 
 if TYPE_CHECKING:
@@ -254,6 +254,7 @@ class Bound:
 
     def _refuse(self, cell: Cell, item: Any) -> None:
         error = MailboxFull(cell.path, self.capacity)
+        cell.node.count_no_room(cell.path)
         if isinstance(item, Ask):
             item.fail(error)
             return
@@ -261,10 +262,11 @@ class Bound:
 
     def _lose(self, cell: Cell, item: Any, displaced_by: str = "") -> None:
         message = item.message if isinstance(item, (Envelope, Ask)) else item
+        cell.node.count_no_room(cell.path)
         if isinstance(item, Ask):
             item.fail(MailboxFull(cell.path, self.capacity, displaced_by))
         sender = item.sender if isinstance(item, (Envelope, Ask)) else None
-        cell.node.dead_letter(cell, message, f"mailbox full ({self.capacity}, {self.overflow})", sender)
+        cell.node.dead_letter(cell, message, drop_reason(self.capacity, self.overflow), sender)
 
     def _lose_queued(self, cell: Cell, keep: int) -> None:
         """Drop queued messages, oldest first, until `keep` are left."""

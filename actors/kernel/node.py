@@ -9,9 +9,10 @@ import random
 import sys
 import time
 import weakref
+from collections import Counter
 from collections.abc import Awaitable, Callable
 from time import monotonic
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeVar
 
 from ..errors import (
     ActorStopped,
@@ -47,6 +48,8 @@ if TYPE_CHECKING:
     from .ref import ActorRef, Target
 
 A = TypeVar("A", bound="Actor")
+NoRoom = Literal["mailbox", "journal", "children"]
+"""What is full that has no room for a message, or for a child."""
 
 SAME_CLOCK = 60.0
 """Seconds by which a loop's clock may be behind the monotonic one that it reads; the clock of a test is elsewhere."""
@@ -93,6 +96,21 @@ class Ports:
     """Runs a function with its arguments in a process of its own."""
 
 
+class Supervised:
+    """What the supervisors of a node have said of themselves.
+
+    Attributes:
+        gave_up: the last one here that did.
+        waiting: those with children that have waited for somebody to whom they are bound; perhaps none waits any more.
+    """
+
+    __slots__ = ("gave_up", "waiting")
+
+    def __init__(self) -> None:
+        self.gave_up: SupervisorGaveUp | None = None
+        self.waiting = weakref.WeakSet[Cell]()
+
+
 def _since_boot() -> float:
     """Seconds since the machine was started, also those in which it has slept, where the system counts them."""
     return time.clock_gettime(time.CLOCK_BOOTTIME) if sys.platform == "linux" else monotonic()
@@ -135,6 +153,7 @@ class Numbers:
         self._token, self._last_token = 0, sys.maxsize
         self.dead_letters = 0
         self.late_replies = 0
+        self.no_room: Counter[tuple[NoRoom, type[Actor] | None]] = Counter()
 
     def next_seed(self) -> int:
         """A seed for an actor's random generator."""
@@ -194,10 +213,10 @@ class Node(RunLoop):
         self.remains: dict[asyncio.Future[Any], str] = {}  # what killed lives have left and is still ending: address
         self.safe: dict[str, asyncio.TimerHandle] = {}  # who is in safe state here: when that should be over
         self.led: dict[str, dict[str, set[str]]] = {}  # of who is replayed: where bindings led, by where they lead
-        self.gave_up: SupervisorGaveUp | None = None  # the last supervisor here that did
+        self.supervised = Supervised()
         self.root: Cell | None = None
         self.arbiter: Any = None  # who may act on which address, once somebody has asked for it
-        self.awaited: dict[str, list[Callable[[], object]]] = {}  # what is done when somebody else has a path
+        self.awaited: dict[str, list[Callable[[], object]]] = {}  # what is done when somebody lives at a path again
         self.on_life: Callable[[Cell], None] | None = None  # told of each life that begins, before it has a message
 
     def connect(self, ports: Ports) -> None:
@@ -252,6 +271,11 @@ class Node(RunLoop):
             known = item.sender.path if isinstance(item, Item) and item.sender is not None else ""
             self.events.emit(DeadLetter(cell.path, item, f"refused: {no}", known))
 
+    def count_no_room(self, path: str, where: NoRoom = "mailbox") -> None:
+        """Count a message that an actor had no room for, and that is refused or lost."""
+        cell = self.find(path)
+        self.numbers.no_room[where, None if cell is None else cell_kind(cell)] += 1
+
     # -- the tree ---------------------------------------------------------------------------------------------------
 
     def cell_below(self, parent: Cell | None, name: str | None, host: Host | None = None) -> Cell:
@@ -298,12 +322,12 @@ class Node(RunLoop):
     async def stop_child(self, cell: Cell) -> ExitReason:
         """Stop a child in good order, as its parent ends: by its spec, if it has one."""
         if cell.state is DOWN or cell.state is GONE:
-            lifecycle.retire(cell, "its parent has stopped")
+            lifecycle.retire_with_parent(cell)
             return cell.extra().reason
         parent = cell.parent
         reason: ExitReason = await (lifecycle.stop_in_time(cell) if cell.spec is None else cell.spec.stop(cell))
         if cell.parent is parent:  # Else it has another one now, and lives on.
-            lifecycle.retire(cell, "its parent has stopped")
+            lifecycle.retire_with_parent(cell)
         return reason
 
     def find(self, path: str) -> Cell | None:

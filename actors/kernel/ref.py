@@ -10,6 +10,7 @@ from typing_extensions import TypeVar
 
 from ..errors import ActorRestarting, HoldfastError, SpecError
 from ..values.saved_refs import Addressed
+from .bindings import note_order
 from .envelope import NO_DEADLINE, Ask, in_next_pass
 from .message import Message
 
@@ -139,6 +140,9 @@ class ActorRef(Addressed, Generic[A_co]):
     def stop(self) -> None:
         """Ask the actor to stop after what it has begun; a second stop is no error."""
         self._cell.node.check_thread(self.path)
+        caller = current.get(None)
+        if caller is not None:
+            note_order(caller._cell, self._cell)
         self._cell.living.request_stop()
 
     def kill(self) -> None:
@@ -148,6 +152,8 @@ class ActorRef(Addressed, Generic[A_co]):
         """
         self._cell.node.check_thread(self.path)
         caller = current.get(None)
+        if caller is not None:
+            note_order(caller._cell, self._cell)
         self._cell.living.kill(by="" if caller is None else caller.path)
 
     def __repr__(self) -> str:

@@ -13,7 +13,26 @@ if TYPE_CHECKING:
 
 
 class Timer:
-    """A handle on one timer; it ends with the life that set it."""
+    """A handle on one timer of an actor, from `ctx.tell_after` or `ctx.every`, for that actor alone.
+
+    Without recovery the timer ends with the life that set it; with recovery it runs on, and the handle may be kept in
+    the state.
+    """
+
+    __slots__ = ()
+
+    @property
+    def is_active(self) -> bool:
+        """Say whether the message of the timer may still come: it runs, or its message waits in the mailbox."""
+        raise NotImplementedError
+
+    def cancel(self) -> None:
+        """Cancel the timer: its message does not come any more, not even if it is queued already."""
+        raise NotImplementedError
+
+
+class LoopTimer(Timer):
+    """A timer on the loop of the actor's process, for one life."""
 
     __slots__ = ("_cell", "_due", "_handle", "_interval", "_queued", "message")
 
@@ -30,7 +49,6 @@ class Timer:
 
     @property
     def is_active(self) -> bool:
-        """Say whether the message of the timer may still come."""
         return self._handle is not None or self._queued
 
     @property
@@ -44,7 +62,6 @@ class Timer:
         return self._interval is not None
 
     def cancel(self) -> None:
-        """Cancel the timer: its message does not come any more, not even if it is queued already."""
         if self._handle is not None:
             self._handle.cancel()
         self._handle = None
@@ -70,7 +87,7 @@ class Timer:
     @classmethod
     def unpacked(
         cls, cell: Cell, message: Message[Any], left: float | None, interval: float | None, queued: bool
-    ) -> Timer:
+    ) -> LoopTimer:
         """Make the timer of an actor that has been moved here again, from its data."""
         timer = cls(cell, message, left or 0.0, interval)
         timer.pause()
@@ -118,7 +135,7 @@ class Tick(Item):
 
     __slots__ = ("chain", "timer")
 
-    def __init__(self, timer: Timer) -> None:
+    def __init__(self, timer: LoopTimer) -> None:
         self.timer = timer
         self.chain: Chain = ()
 
@@ -134,7 +151,7 @@ class Tick(Item):
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
-        timer: Timer = item.timer
+        timer: LoopTimer = item.timer
         if not timer.taken():
             return None
         return actor._table[type(timer.message)](actor, timer.message)

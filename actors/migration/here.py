@@ -16,7 +16,7 @@ from ..kernel.context import ActorContext
 from ..kernel.envelope import Item
 from ..kernel.lifecycle import Stop
 from ..kernel.mailbox import Bound
-from ..kernel.timers import Timer
+from ..kernel.timers import LoopTimer
 from .luggage import check_sendable, let_come, pack_rest
 from .move import Entering, Leaving, Move
 from .quiesce import PackLife, Transit, decoded, farewell, now, part, resume, settle, sorted_out, twin
@@ -24,7 +24,7 @@ from .worker_moves import await_up
 
 if TYPE_CHECKING:
     from ..kernel.actor import Actor, Start
-    from ..kernel.links import Monitor
+    from ..kernel.links import LifeMonitor
 
 
 class FromHere(Leaving):
@@ -36,7 +36,7 @@ class FromHere(Leaving):
         self._old: Cell | None = None
         self._topics: set[str] = set()
         self._links: set[Cell] = set()
-        self._watches: set[Monitor] = set()
+        self._watches: set[LifeMonitor] = set()
 
     async def quiesce(self) -> None:
         move, entering = self.move, self.move.entering
@@ -208,7 +208,7 @@ class ToHere(Entering):
         commands = arrival.take_over(luggage.queue, luggage.stash, bound, suspended=luggage.suspended)
         for name, body, left, interval in luggage.timers:
             message = cell.node.codec.decode(cell.table.kind_named(name), body)
-            Timer.unpacked(cell, message, max(0.0, left), interval or None, False)
+            LoopTimer.unpacked(cell, message, max(0.0, left), interval or None, False)
         let_come(cell, luggage.waiting)
         if bound is not None:
             let_in(cell, bound)

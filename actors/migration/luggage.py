@@ -16,10 +16,10 @@ from ..errors import BadMessage, HoldfastError, error_text, type_name
 from ..exit_reasons import pack_exit, unpack_exit
 from ..kernel import mailbox
 from ..kernel.codec import Parcel
-from ..kernel.envelope import Ask, Envelope, Item, ReplyHandle
-from ..kernel.links import Down, Exit, Monitor
+from ..kernel.envelope import Ask, AskHandle, Envelope, Item
+from ..kernel.links import Down, Exit, LifeMonitor
 from ..kernel.message import message_name
-from ..kernel.timers import Timer
+from ..kernel.timers import LoopTimer
 from ..state_hooks import state_getter
 from ..values import UnsavableValue, decode_value, encode_value
 
@@ -100,15 +100,15 @@ class StatePacker:
         return lifted
 
     def _stand_in(self, value: Any) -> Any:
-        if isinstance(value, Timer):
+        if isinstance(value, LoopTimer):
             return PackedHandle("timer", self._timers.index(value) if value in self._timers else -1)
-        if type(value) is ReplyHandle:
+        if type(value) is AskHandle:
             ask = value.ask
             if ask is None or ask.is_done:
                 return PackedHandle("reply", -1)
             self._owed.add(id(ask))
             return PackedHandle("reply", self._owe(ask))
-        if isinstance(value, Monitor):
+        if isinstance(value, LifeMonitor):
             return PackedHandle("watch", [value.name, value.for_good])
         return value
 
@@ -138,7 +138,7 @@ def pack_rest(actor: Actor) -> dict[str, Any]:
 
 
 def unpack(
-    actor: Actor, state: bytes, rest: dict[str, Any], owed: Owed, watched: Callable[[str, bool], Monitor]
+    actor: Actor, state: bytes, rest: dict[str, Any], owed: Owed, watched: Callable[[str, bool], LifeMonitor]
 ) -> None:
     """Give a new life what the old one has packed; `owed` and `watched` find what its handles stand for.
 
@@ -149,10 +149,10 @@ def unpack(
     codec = cell.node.codec
     cell.extra().trap_exits = rest["trap_exits"]
     actor.ctx._borrow_promises()
-    timers: list[Timer] = []
+    timers: list[LoopTimer] = []
     for name, body, left, interval, queued in rest["timers"]:
         message = codec.decode(cell.table.kind_named(name), body)
-        timers.append(Timer.unpacked(cell, message, left, interval, queued))
+        timers.append(LoopTimer.unpacked(cell, message, left, interval, queued))
 
     def found(value: Any) -> Any:
         if not isinstance(value, PackedHandle):
@@ -161,7 +161,7 @@ def unpack(
             case "timer":
                 return timers[value.key] if value.key >= 0 else over(cell)
             case "reply":
-                return ReplyHandle[Any](None) if value.key < 0 else actor.ctx._promise(owed(value.key))
+                return AskHandle[Any](None) if value.key < 0 else actor.ctx._promise(owed(value.key))
             case _:
                 return watched(*value.key)
 
@@ -171,10 +171,10 @@ def unpack(
     put_state(actor, lift(values, found) if holds else values)
 
 
-def over(cell: Cell) -> Timer:
+def over(cell: Cell) -> LoopTimer:
     """A timer whose message has come, or never will."""
-    timer: Timer = Timer.__new__(Timer)
-    Timer.ended(timer, cell)
+    timer: LoopTimer = LoopTimer.__new__(LoopTimer)
+    LoopTimer.ended(timer, cell)
     return timer
 
 
@@ -217,7 +217,7 @@ def unpack_items(cell: Cell, packed: list[list[Any]], known: Callable[[list[Any]
             case ["exit", str(source), reason]:
                 items.append(Exit(node.cell_at(source), unpack_exit(reason)))
             case ["down", str(source), reason, bool(recovering), bool(for_good)]:
-                watch = Monitor(cell, node.cell_at(source), for_good)
+                watch = LifeMonitor(cell, node.cell_at(source), for_good)
                 items.append(Down(watch, unpack_exit(reason), recovering))
             case ["message", str(name), bytes(body), sender]:
                 message = node.codec.decode(cell.table.kind_named(name), body)

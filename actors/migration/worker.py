@@ -13,7 +13,7 @@ from ..kernel import mailbox
 from ..kernel.cell import Cell
 from ..kernel.envelope import Ask, Item
 from ..kernel.lifecycle import PATIENCE
-from ..kernel.links import Monitor
+from ..kernel.links import LifeMonitor
 from ..process.process_host import Outlet, RemoteBound, WorkerPlace, admit_remote, admit_remote_bounded
 from ..process.wire.start_codec import pack_recipe
 from .here import let_in
@@ -235,8 +235,8 @@ class FromWorker(FromOwnWorker):
         luggage = self.move.luggage
         unpack(actor, luggage.state, luggage.rest, self._asks.__getitem__, self._watched)
 
-    def _watched(self, path: str, for_good: bool) -> Monitor:
-        watching: dict[Monitor, None] = self.cell.extra().ties.watching
+    def _watched(self, path: str, for_good: bool) -> LifeMonitor:
+        watching: dict[LifeMonitor, None] = self.cell.extra().ties.watching
         return next(watch for watch in watching if watch.name == path and watch.for_good is for_good)
 
     def died(self, cell: Cell, reason: ExitReason) -> None:

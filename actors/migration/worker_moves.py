@@ -14,7 +14,7 @@ from ..kernel.actor import Actor, Start
 from ..kernel.cell import RUNNING, Cell, Host
 from ..kernel.context import ActorContext
 from ..kernel.envelope import Ask, Item
-from ..kernel.links import Monitor
+from ..kernel.links import LifeMonitor
 from ..process.wire.frames import BadFrame
 from ..process.wire.peer import Arrived, RelayedAsk
 from ..process.wire.start_codec import unpack_recipe
@@ -167,8 +167,10 @@ class GuestMove:
         )
         return await_up(cell, start)
 
-    def _watch(self, cell: Cell, path: str, for_good: bool) -> Monitor:
-        return links.note_watch(Monitor(cell, self._guest.node.cell_at(path), for_good))  # The root keeps it already.
+    def _watch(self, cell: Cell, path: str, for_good: bool) -> LifeMonitor:
+        return links.note_watch(
+            LifeMonitor(cell, self._guest.node.cell_at(path), for_good)
+        )  # The root keeps it already.
 
     def _owed(self, key: int) -> Ask:
         """An ask that the root waits with for its reply."""
@@ -300,5 +302,5 @@ def _number(ask: Ask) -> int:
     return ask.id
 
 
-def _found(watches: list[Monitor], path: str, for_good: bool) -> Monitor:
+def _found(watches: list[LifeMonitor], path: str, for_good: bool) -> LifeMonitor:
     return next(watch for watch in watches if watch.name == path and watch.for_good is for_good)

@@ -21,8 +21,8 @@ class ProcessEnd:
     """What we have killed it for; it may not have died yet."""
     status: int | None = None
     """How the fork server has reaped it, as `waitpid` reports it."""
-    is_orphaned: bool = False
-    """Whether the fork server has died, and it with it: nobody will tell its status."""
+    orphaned: ExitReason | None = None
+    """What its fork server has ended it for, by its own end: nobody will tell its status."""
     is_lost: bool = False
     """Whether its socket has ended: what it wrote before its end has come."""
     is_buried: bool = False
@@ -33,7 +33,7 @@ class ProcessEnd:
     @property
     def is_complete(self) -> bool:
         """Whether nothing more will be heard of it."""
-        return self.is_lost and (self.status is not None or self.is_orphaned)
+        return self.is_lost and (self.status is not None or self.orphaned is not None)
 
     def reason(self, oom_kills: int) -> ExitReason:
         """Why it ended: what it said itself, what we killed it for, or what the system reports.
@@ -47,7 +47,7 @@ class ProcessEnd:
             return self.killed_for
         status = self.status
         if status is None:
-            return Signal(signal.SIGKILL)  # Ended with its fork server.
+            return self.orphaned or Signal(signal.SIGKILL)
         if os.WIFSIGNALED(status):
             number = os.WTERMSIG(status)
             if number == signal.SIGKILL and oom_kills > self.oom_before:

@@ -643,6 +643,8 @@ def _command(node: Node, worker: Worker, frame: frames.Command) -> None:
         case "gone":
             reason, with_parent = unpack_exit(frame.data.get("reason")), bool(frame.data.get("with_parent"))
             worker.inner.gone(frame.data["path"], reason, with_parent=with_parent)
+        case "waits":
+            node.supervised.waiting.add(cell)
         case "undone":
             worker.inner.undone(frame.data["path"])
         case "name":

@@ -14,7 +14,7 @@ from ..control.orders import ObserveTurns
 from ..control.orders_lane import order, send_call
 from ..errors import AskFailed, ProcessUnavailable, StartFailed, StartIgnored
 from ..events import TRACED, LogLine, ProcessDied, ProcessStarted, TrustBreached
-from ..exit_reasons import KILLED, ExitReason, Hung, TrustBreach, pack_exit, unpack_exit
+from ..exit_reasons import KILLED, ExitReason, ForkServerDied, Hung, TrustBreach, pack_exit, unpack_exit
 from ..kernel.cell import Cell
 from ..migration.words import NO_ATTEMPT, say
 from ..streams import check_can_watch
@@ -352,25 +352,21 @@ class Worker(Peer):
         self._noticed()
         self._bury_soon()
 
-    def on_orphaned(self) -> None:
-        """The fork server has died, and it with it: nobody will tell its exit status."""
-        self.end.is_orphaned = True
-        if self.end.is_complete:
-            self._bury()
-
-    def on_given_up(self) -> None:
-        """Its fork server was stopped, which kills it; nobody waits any longer to hear of its end."""
-        self.end.is_orphaned = True
-        self._bury()
-
     def _bury_soon(self) -> None:
         """At once if all is known. What it wrote before its end may still be in the socket, whose end comes behind."""
-        if self.end.is_complete:
-            self._bury()
+        if self.end.orphaned is not None:
+            self._workers.bury_orphans(self.server)
+        elif self.end.is_complete:
+            self.bury()
         else:
-            self.node.loop.call_later(REAPED_WITHIN, self._bury)
+            self.node.loop.call_later(REAPED_WITHIN, self._bury_late)
 
-    def _bury(self) -> None:
+    def _bury_late(self) -> None:
+        if self.end.orphaned is None:  # Else it is told of with the others.
+            self.bury()
+
+    def bury(self) -> None:
+        """It has ended: tell everybody, and give back what it had."""
         if self.end.is_buried:
             return
         self.end.is_buried = True
@@ -561,9 +557,24 @@ class Workers:
             self._servers.remove(server)
         if self._server is server:
             self._server = None
-        for worker in list(self._alive.values()):
-            if worker.server is server:
-                worker.on_orphaned()
+        why = ForkServerDied(server.pid, server.died_of)
+        for worker in self._children_of(server):
+            worker.end.orphaned = why
+        self.bury_orphans(server)
+        self.node.loop.call_later(REAPED_WITHIN, functools.partial(self.bury_orphans, server, late=True))
+
+    def _children_of(self, server: ForkServer) -> list[Worker]:
+        return [worker for worker in self._alive.values() if worker.server is server]
+
+    def bury_orphans(self, server: ForkServer, *, late: bool = False) -> None:
+        """Tell at once of all that have ended with their fork server: their supervisors see that it is one fault.
+
+        Not before what they wrote has come, unless it is `late`.
+        """
+        orphans = self._children_of(server)
+        if late or all(worker.end.is_complete for worker in orphans):
+            for worker in orphans:
+                worker.bury()
 
     def buried(self, worker: Worker) -> None:
         """A process is gone for good."""
@@ -606,4 +617,4 @@ class Workers:
         for server in servers:
             await server.stop()
         for worker in list(self._alive.values()):  # Its server could not tell of its end, or not in time.
-            worker.on_given_up()
+            worker.bury()

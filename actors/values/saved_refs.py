@@ -1,4 +1,4 @@
-"""Refs among values: what is saved of one is its address."""
+"""What stands for somebody or something in values: refs, of which the address is saved, and handles."""
 
 from __future__ import annotations
 
@@ -12,6 +12,12 @@ class Addressed:
     def path(self) -> str:
         """The address, such as `/app/bank/alice`."""
         raise NotImplementedError
+
+
+class Kept:
+    """What a state may hold and no message: it is saved as its attributes, in the form of a dataclass."""
+
+    __slots__ = ()
 
 
 class SavedRef(Addressed):

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from ...actors.errors import HoldfastError, MailboxFull
 from ...actors.kernel.codec import Parcel
 from ...actors.kernel.mailbox import Bound, Senders
-from ...actors.overflow import DROPS, Overflow, decide
+from ...actors.overflow import DROPS, Overflow, decide, drop_reason
 from ..inputs import Batch, Input
 from ..protocol import MESSAGE, Answer
 from .disposal import lose
@@ -73,16 +73,14 @@ class HomeBound:
             self.waiting.append((ask, name, body, sender))
             return False
         error = MailboxFull(self._home.path, self.capacity)
+        self._home.node.count_no_room(self._home.path)
         if verdict == "lose":
-            lose(self._home, Parcel(name, body), self._why())
+            lose(self._home, Parcel(name, body), drop_reason(self.capacity, self.overflow))
         elif ask is None:
             raise error
         if ask is not None:
             ask.fail(error)
         return False
-
-    def _why(self) -> str:
-        return f"mailbox full ({self.capacity}, {self.overflow})"
 
     def _drop(self, keep: int) -> None:
         """End queued messages, oldest first, until `keep` are left."""
@@ -94,7 +92,8 @@ class HomeBound:
                 break
             if source.id not in (self._fed, home.ledger.begun):
                 self._behind.pop(source.id, None)
-                lose(home, source, self._why())
+                home.node.count_no_room(home.path)
+                lose(home, source, drop_reason(self.capacity, self.overflow))
                 home.end_without_turn(source, error, batch)
         batch.commit(home.journal)
 

@@ -9,15 +9,15 @@ import asyncio
 import dataclasses
 from collections import deque
 from collections.abc import Awaitable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from ...actors.errors import HoldfastError, MailboxFull
 from ...actors.events import HeldMessages
 from ...actors.kernel.cell import GONE, Cell
 from ...actors.kernel.codec import Parcel
-from ...actors.kernel.envelope import Item
+from ...actors.kernel.envelope import Ask, Item
 from ...actors.kernel.mailbox import Senders, admit_gone
-from ...actors.overflow import decide
+from ...actors.overflow import decide, held_drop_reason
 from ..inputs import Batch, Input
 from ..protocol import MESSAGE, Answer
 from ..recovery_settings import Held
@@ -26,8 +26,8 @@ from .pending_asks import SwitchAsk, turned_away
 
 if TYPE_CHECKING:
     from ...actors.kernel.cell import Host
-    from ...actors.kernel.envelope import Ask
     from .capacity import HomeBound
+    from .recorded_home import RecordedHome
     from .switch import Switch
 
 MAY_LIVE_AGAIN = "its supervisor has ended, and may start it again"
@@ -53,6 +53,13 @@ class Holding:
     def capacity(self) -> int:
         """The capacity of the mailbox itself."""
         return self.inner.capacity if self.inner is not None else 0
+
+    @property
+    def is_full(self) -> bool:
+        """Whether one more, that comes by no topic with a rule of its own, would be too many."""
+        rule = self._rules[""]
+        is_over = rule is not None and self._count("") >= rule.capacity
+        return is_over or (self.inner is not None and self.inner.is_full)
 
     @property
     def overflow(self) -> str:
@@ -90,6 +97,7 @@ class Holding:
     def _turn_away(self, rule: Held, ask: Ask | None, name: str, body: bytes, *, is_lost: bool) -> None:
         """Raises MailboxFull: it is a tell, and its sender is to know."""
         error = MailboxFull(self._home.path, rule.capacity)
+        self._home.node.count_no_room(self._home.path)
         if is_lost:
             self.dropped += 1
             lose(self._home, Parcel(name, body), _why(rule))
@@ -115,6 +123,7 @@ class Holding:
         mine = [source for source, by in self._counted.values() if by == topic]
         for source in mine[: len(mine) - keep]:
             self.dropped += 1
+            home.node.count_no_room(home.path)
             lose(home, source, _why(rule))
             home.end_without_turn(source, answer, batch)
         batch.commit(home.journal)
@@ -204,7 +213,7 @@ class Holding:
 
 
 def _why(rule: Held) -> str:
-    return f"there was no room while messages were held (for {rule.capacity}, {rule.overflow})"
+    return held_drop_reason(rule.capacity, rule.overflow)
 
 
 class Inlet(Cell):
@@ -326,6 +335,29 @@ def admit_between(cell: Cell, item: Any) -> None:
         item.fail(cell.stopped_error(MAY_LIVE_AGAIN))
     else:
         cell.home.admit(cell, item)
+
+
+def admit_unread(cell: Cell, item: Any) -> None:
+    """The first message to an address whose home has not been read from the store in this program: it is, now.
+
+    Raises:
+        HoldfastError: it cannot be, and the item is no ask, which fails for that reason.
+    """
+    cell.node.check_thread(cell.path)
+    home = cast("RecordedHome", cell.host.home)
+    try:
+        home.take_in(cell)
+    except HoldfastError as error:
+        if not isinstance(item, Ask):
+            raise
+        item.fail(error)
+    else:
+        cell.admit(cell, item)
+
+
+def is_unread(cell: Cell) -> bool:
+    """Whether an address was made ahead of its first life, and its home has not been read from the store."""
+    return cell.admit is admit_unread
 
 
 @dataclasses.dataclass(slots=True)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from ...actors.errors import ControlFailed, HoldfastError, StartFailed
 from ...actors.events import RecordsMapped, RecoveryFailed
 from ...actors.kernel.cell import DOWN, GONE, Cell
-from ...actors.persistence import CHILDREN, child_key
+from ...actors.persistence import CHILDREN, ENTRIES, child_key
 from ..address_tree import AddressTree
 from ..addresses import Addresses, is_of_actor, renamed
 from ..group_commit import Commits, Unkept
@@ -28,9 +28,11 @@ from .capacity import HomeBound
 from .disposal import Erased, Erasures, drop_all, forget_home, put_into_quarantine
 from .held_messages import Holding, end_wait, let_go
 from .quarantine import Quarantine
+from .registered_keys import RegisteredKeys
 from .switch import Switch
 
 if TYPE_CHECKING:
+    from ...actors.kernel.codec import Codec
     from ...actors.kernel.mailbox import Bound
     from ...actors.kernel.node import Node
 
@@ -41,6 +43,11 @@ OPENED = "opened"
 """The fact that says when the root was begun whose fencing tokens were the largest: a whole number, of seconds."""
 TOKEN_BITS = 31
 """Of the part of a fencing token that counts within a second; in front of it are whole seconds."""
+
+
+def never_again(codec: Codec, name: str, body: bytes) -> bool:
+    """Say of every message that it may be handled only once."""
+    return False
 
 
 class Homes:
@@ -54,8 +61,10 @@ class Homes:
         durability: Durability | None = None,
         file: RecoveryFile | None = None,
         hooks: RecoveryHooks | None = None,
+        bears_repetition: Callable[[Codec, str, bytes], bool] = never_again,
     ) -> None:
         self.node = node
+        self.bears_repetition = bears_repetition
         self.journal = Commits(journal, node.loop, durability=durability or "os", emit=node.emit, where=f"/{node.name}")
         self._unkept = Unkept(self.journal)
         self.addresses = Addresses(node, journal, self.find)
@@ -72,6 +81,7 @@ class Homes:
         self._stored = set(filter(is_of_actor, journal.addresses()))
         self._known = AddressTree(self._stored)  # with those at which somebody was started since
         self._noted = AddressTree(key.removeprefix(CHILDREN) for key in journal.notes(CHILDREN))  # children
+        self._entries = RegisteredKeys(self.journal)
         self.groups = Groups(self)
         self.rejoin = Rejoin(self)
         self.far = FarMail(self)
@@ -82,6 +92,18 @@ class Homes:
 
         Raises:
             StartFailed: the class that is to live there would misread what is recorded.
+        """
+        switch = self.expecting(cell, method)
+        self.absolve(cell.path)
+        self.on_home(switch)
+        self.groups.opened(switch)
+        return switch
+
+    def expecting(self, cell: Cell, method: Method) -> Switch:
+        """The home of an address where the next life is still to begin, as `of` takes it up; it holds what comes.
+
+        Raises:
+            StartFailed: as `of`.
         """
         path = cell.path
         switch = self._switches.get(path)
@@ -100,16 +122,13 @@ class Homes:
             if self.on_first is not None:
                 begin, self.on_first = self.on_first, None
                 begin()
-        self.absolve(path)
         switch.begin_at(cell, method)
         if switch.journal.durable:
             self.journal.want(path, method.durability)
-        self.on_home(switch)
         more = cell.extra()
         if more.bound is not None:
             _bind(switch, more.bound)
             more.bound = None
-        self.groups.opened(switch)
         cell.admit = switch.admit
         more.outlet = switch
         return switch
@@ -222,6 +241,7 @@ class Homes:
             if (now := renamed(names, above)) != above:
                 self.note(key, None)
                 self.note(child_key(now, name), value)
+        self._entries.rename(names)
         self.quarantine.rename(paths)
 
     def vacate(self, path: str, why: str) -> None:
@@ -330,6 +350,7 @@ class Homes:
         if not self.addresses.is_lent(path):  # Else the store has there what was recorded of one that has moved away.
             self.journal.erase(path)  # First: if the store refuses, nothing is forgotten here either.
         self.addresses.erased(path)
+        self._entries.erase(path)
         self._stored.discard(path)
         self._known.discard(path)
         self._blamed.discard(path)
@@ -391,6 +412,12 @@ class Homes:
                 self._noted.discard(path)
             else:
                 self._noted.add(path)
+        elif key.startswith(ENTRIES):
+            self._entries.noted(key, value)
+
+    def noted(self, key: str) -> bytes | None:
+        """The fact of that name, or None."""
+        return self.journal.noted(key)
 
     def notes(self, prefix: str) -> dict[str, bytes]:
         """The facts whose keys begin so, oldest first."""

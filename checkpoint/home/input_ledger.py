@@ -201,6 +201,13 @@ class InputLedger:
             if turn.status in (OK, STASHED) and number not in left_out
         ]
 
+    def spent(self) -> list[tuple[int, str]]:
+        """The turns that no life handles again though a timer has come in them, each with that."""
+        ends = self.turns.items()
+        return [
+            (at, one.input.origin) for at, one in ends if one.input.kind == TICK and one.status in (FAILED, DROPPED)
+        ]
+
     def ended_in_the_stash(self) -> tuple[int, ...]:
         """Inputs that are put aside under replay, though they have ended since."""
         stashed = (turn.input.id for turn in self.turns.values() if turn.status == STASHED)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from ...actors.errors import HoldfastError, StartFailed, StartIgnored
 from ...actors.events import ActorStarted, Recovered, RecoveryFailed
-from ...actors.exit_reasons import KILLED, ExitReason, Hung, crash
+from ...actors.exit_reasons import ExitReason, Hung, crash
 from ...actors.kernel import links
 from ...actors.kernel.address_host import Work
 from ...actors.kernel.cell import RUNNING, Cell, TurnRest
@@ -25,7 +25,16 @@ from ..recovery.recoveries import Recovery
 from ..snapshot.unreplayed import forget_turns
 from ..turn_word import input_of
 from .disposal import drop_all
-from .held_messages import MAY_LIVE_AGAIN, end_wait, hold, inlet, let_go, wait_for_next_life
+from .held_messages import (
+    MAY_LIVE_AGAIN,
+    admit_unread,
+    end_wait,
+    hold,
+    inlet,
+    is_unread,
+    let_go,
+    wait_for_next_life,
+)
 from .homes import ENDED, Homes
 from .life_ports import RemoteLife, own_records
 from .present_life import LifePort
@@ -89,6 +98,17 @@ class JournalHome(RecordedHome):
         self.recovery: Recovery | None = None  # that of the life which is begun now
         self.page: memoryview | None = None  # of a life in this process: which input it has in hand
         self.fault: Literal["", "killed", "hung"] = ""  # why the end that is ordered counts against the turn in hand
+
+    def expect(self, cell: Cell) -> None:
+        if self.homes.at(cell.path) is None:
+            cell.admit = admit_unread
+        else:
+            self.take_in(cell)
+
+    def take_in(self, cell: Cell) -> None:
+        switch = self.switch = self.homes.expecting(cell, self.method)
+        if not switch.ledger.is_new:
+            hold(switch)
 
     def enter(self, cell: Cell) -> Entered:
         """As `open`, and it is a recovery if anything comes back, or if one is not over."""
@@ -194,6 +214,8 @@ class JournalHome(RecordedHome):
 
     def offer(self, cell: Cell, item: Any) -> Awaitable[None] | None:
         """Admit a message for a sender that waits until it counts."""
+        if is_unread(cell):
+            self.take_in(cell)
         switch = self.switch
         before = None if switch is None else switch.intake.last
         cell.admit(cell, item)
@@ -316,7 +338,7 @@ class JournalHome(RecordedHome):
         """Keep everything, and count deaths in the same turn."""
         if worker is None or cell.state is not RUNNING:
             return None
-        running, noticed, ordered = self.in_hand(worker), worker.end.noticed_at, reason == KILLED
+        running, noticed, ordered = self.in_hand(worker), worker.end.noticed_at, reason.blames_nobody
 
         def over(recovers: bool | None) -> None:
             self.over(

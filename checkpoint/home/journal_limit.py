@@ -69,6 +69,7 @@ class Limit:
             home.node.emit(JournalFull(home.path, home.ledger.state_turn, home.ledger.journal_bytes, self._way_out()))
         self._want_snapshot()
         error = MailboxFull(home.path, len(home.ledger.open))
+        home.node.count_no_room(home.path, "journal")
         if ask is None:
             raise error
         ask.fail(error)

@@ -19,12 +19,13 @@ from ..life.recorded_inbox import STARTED
 from ..protocol import MESSAGE, PIPE, Answer, Hooked, Out, PipeDone
 from .admission import TurnRows
 from .ask_recovery import origin_asked, origin_kept
-from .held_messages import Inlet, inlet
+from .held_messages import Inlet, inlet, is_unread
 from .pending_asks import SwitchAsk, answer_ask, origin_of
 from .present_life import LifePort
 from .recorded_home import switch_of
 
 if TYPE_CHECKING:
+    from ...actors.kernel.envelope import Ask
     from .switch import Switch
 
 
@@ -194,7 +195,8 @@ class Outputs:
         if far.lasts(out.to):
             far.keep(origin_kept(home, turn, out), out, sender, batch)
             return True
-        return target.is_dead and home.homes.rejoin.keep(home, origin_kept(home, turn, out), out, sender, batch)
+        is_there = not target.is_dead and not is_unread(target)
+        return not is_there and home.homes.rejoin.keep(home, origin_kept(home, turn, out), out, sender, batch)
 
     def _publish(self, turn: int, out: Out, batch: Batch) -> None:
         """A message to each subscriber, when it has room; the publisher waits until the last one has accepted it."""
@@ -302,30 +304,45 @@ class Outputs:
     def _ask(self, turn: int, key: int, out: Out, batch: Batch) -> None:
         home = self._home
         target, source = home.node.cell_at(out.to), home.ledger.open.get(key)
-        if target.is_dead and switch_of(target) is None:
+        if (target.is_dead or is_unread(target)) and switch_of(target) is None:
             origin = origin_asked(home, turn, out, source)
             if home.homes.rejoin.keep(home, origin, out, home.path, batch):
-                home.homes.rejoin.joins(
-                    home, turn, key, out
-                )  # It is as if it had been asked before this program began.
+                # It is as if it had been asked before this program began.
+                home.homes.rejoin.joins(home, turn, key, out)
                 return
+        ask = self._made(turn, key, out, target)
+        switch = switch_of(target)
+        if switch is None:
+            batch.after.append(lambda: self._send_ask(key, target, ask))
+        elif switch.waits(ask):
+            ask.give(Answer(*home.node.codec.encode_error(AskDeadlock(out.to, waiters(ask.chain)))), batch)
+        elif (bound := switch.intake.bound) is None or bound.makes_room(ask, out.name, out.body, home.path):
+            self._record_ask(switch, ask, out, home.path, batch)
+        if switch is not None and switch.intake.between is not None:
+            batch.after.append(ask.strand)
+
+    def _made(self, turn: int, key: int, out: Out, target: Cell) -> SwitchAsk:
+        """The ask that is an output of the turn in hand, which waits for it from now on."""
+        home, source = self._home, self._home.ledger.open.get(key)
         chain = ((home.path, key), *(source.chain if source is not None else ()))
         if out.trace:
             chain = with_tail(chain, out.trace)
         ask = SwitchAsk.made(home, turn, out, chain, target, source)
         home.calls.asks[turn, out.k] = ask
         home.node.deadlines.add(ask)
-        switch = switch_of(target)
-        if switch is None:
-            batch.after.append(lambda: self._send_ask(key, target, ask))
-        elif switch.waits(ask):
-            ask.give(Answer(*home.node.codec.encode_error(AskDeadlock(out.to, waiters(chain)))), batch)
-        elif (bound := switch.intake.bound) is None or bound.makes_room(ask, out.name, out.body, home.path):
-            asked = switch.record(MESSAGE, out.name, out.body, home.path, batch, origin_of(ask))
-            asked.ask, asked.chain = ask, chain
-            batch.after.append(lambda: switch.admitted(asked))
-        if switch is not None and switch.intake.between is not None:
-            batch.after.append(ask.strand)
+        return ask
+
+    def ask_again(self, turn: int, key: int, out: Out) -> None:
+        """Ask somebody who keeps no journal what was asked in an earlier program, and may be handled twice."""
+        target = self._home.node.cell_at(out.to)
+        self._send_ask(key, target, self._made(turn, key, out, target))
+
+    def _record_ask(self, switch: Switch, ask: Ask, out: Out, sender: str | None, batch: Batch) -> None:
+        """An ask to a recorded actor, up or not, is journaled in the same append."""
+        origin = origin_of(ask) if isinstance(ask, SwitchAsk) else ""
+        asked = switch.record(MESSAGE, out.name, out.body, sender, batch, origin)
+        asked.ask, asked.chain = ask, ask.chain
+        batch.after.append(lambda: switch.admitted(asked))
 
     def _send_ask(self, key: int, target: Cell, ask: SwitchAsk) -> None:
         home, target = self._home, target.living
@@ -356,13 +373,18 @@ class Outputs:
         ask = source.ask if source is not None else None
         target = home.node.cell_at(out.to)
         if source is None or ask is None:
-            sender = None if source is None else source.sender
-            self._deliver(target, turn, out, batch, sender)
+            self._deliver(target, turn, out, batch, None if source is None else source.sender)
             return
         source.ask = None  # From now on it is the receiver's to answer.
         if out.trace:
             ask.chain = with_tail(ask.chain, out.trace)
             follow(ask)
+        switch, sender = switch_of(target), None if ask.sender is None else ask.sender.path
+        if switch is not None and not switch.waits(ask) and switch.takes_now(ask, out, sender):
+            self._record_ask(switch, ask, out, sender, batch)
+            if switch.intake.between is not None and isinstance(ask, SwitchAsk):
+                batch.after.append(ask.strand)
+            return
 
         def send() -> None:
             there = target.living

@@ -15,7 +15,15 @@ class RecordedHome(WorkerHome):
     """A home with a switch, which numbers, journals and feeds what it accepts."""
 
     switch: Switch | None
-    """There is none before the first life begins."""
+    """There is none before the first life begins, or is waited for with a message."""
+
+    def take_in(self, cell: Cell) -> None:
+        """Record what is sent to an address ahead of its first life in this program, and hold it for that.
+
+        Raises:
+            HoldfastError: what is recorded of it cannot be read, or does not fit its class.
+        """
+        raise NotImplementedError
 
     @property
     def keeps_turns(self) -> bool:

@@ -41,6 +41,7 @@ class PacedReplay:
         self._handle: asyncio.TimerHandle | None = None
         self._told_at = float("-inf")
         self._fed = -1  # the last turn that was fed
+        self._spent = deque[tuple[int, str]]()
 
     def begin(self, port: LifePort, turns: Iterable[tuple[int, Turn]], then: Callable[[], None]) -> None:
         """Feed ended turns in turn order, then call `then`.
@@ -48,6 +49,7 @@ class PacedReplay:
         Each is due as long after the first as it was when they were recorded, divided by the speed: a handler that
         takes its time does not add to that, and all of it never takes longer than what was recorded did.
         """
+        self._spent = deque(self._home.ledger.spent())
         speed = self._home.method.speed
         if not speed:
             for number, turn in turns:
@@ -68,8 +70,17 @@ class PacedReplay:
 
     def _feed(self, port: LifePort, number: int, turn: Turn) -> None:
         pipes = self._home.ledger.pipes_done.get(number, ())
-        port.to_life(turn.input.feed(number, tuple(sorted(pipes)), was_asked=turn.reply != 0))
+        feed = turn.input.feed(number, tuple(sorted(pipes)), was_asked=turn.reply != 0)
+        feed.spent = self.spent_before(number)
+        port.to_life(feed)
         self._fed = number
+
+    def spent_before(self, turn: float) -> tuple[str, ...]:
+        """The timers that have come in turns before this one, which a replay leaves out, and that were not told."""
+        spent: list[str] = []
+        while self._spent and self._spent[0][0] < turn:
+            spent.append(self._spent.popleft()[1])
+        return tuple(spent)
 
     def pauses_at(self, turn: int) -> bool:
         """Whether all that was fed is handled, up to this turn, and it is not yet time for the next."""

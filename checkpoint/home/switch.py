@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import asyncio
 import functools
+import math
 from threading import get_ident
 from typing import TYPE_CHECKING, Any
 
@@ -205,6 +206,13 @@ class Switch:
         """Whether senders wait until the next snapshot has cut the journal."""
         return self.limit.is_reached and not self.limit.makes_room() and self.method.snapshots
 
+    def takes_now(self, ask: Ask, out: Out, sender: str | None) -> bool:
+        """Whether an ask does not have to wait, and nothing is lost for it, whatever the policy."""
+        bound = self.intake.bound
+        if self.is_at_limit or (bound is not None and bound.is_full):
+            return False
+        return bound is None or bound.makes_room(ask, out.name, out.body, sender)
+
     @property
     def has_room(self) -> bool:
         """Whether a message would be taken now: the journal has room, and the mailbox."""
@@ -363,7 +371,8 @@ class Switch:
         gone, begun = self.ledger.ended_in_the_stash(), -1 if first is not None else self.ledger.begun
         ledger, own = self.ledger, self.ledger.own_end
         timers = self.timers.after(ledger.turn)
-        port.to_life(Go(recovered, ledger.turn, gone, timers, begun, own.wanted, own.past))
+        spent = self.replay.spent_before(math.inf)
+        port.to_life(Go(recovered, ledger.turn, gone, timers, begun, own.wanted, own.past, spent))
 
     def let_at(self) -> None:
         """Let the actor at what is new, if nobody else has a say in that."""
@@ -393,6 +402,8 @@ class Switch:
             bound.refill()
         self.due.on_want(self)
         self.ties.tie()
+        for come in self.node.awaited.pop(self.path, ()):
+            come()
         if holding is not None:
             holding.let_in()
 

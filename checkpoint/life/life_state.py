@@ -70,18 +70,38 @@ class RestoredState:
 
 
 @dataclasses.dataclass(slots=True)
-class HookTimers:
+class LifeTimers:
     """The timers of a life, as far as it has to know them.
 
     Attributes:
+        active: those whose messages may still come, after the turns that were handled. Another dict with each change.
         running: those that run at home, as far as a hook has not said so.
         cancelled: timers whose ticks may still be on their way.
         named: how many timers of hooks say this, by its checksum.
     """
 
+    active: dict[str, Clock] = dataclasses.field(default_factory=dict)
     running: dict[str, Clock] = dataclasses.field(default_factory=dict)
     cancelled: set[str] = dataclasses.field(default_factory=set)
     named: dict[str, int] = dataclasses.field(default_factory=dict)
+
+    def take(self, clocks: dict[str, Clock]) -> None:
+        """Take the timers that ran where the life begins."""
+        self.active = self.active | clocks
+        self.running.update(clocks)
+
+    def set(self, key: str, clock: Clock) -> None:
+        """A turn or a hook has set one."""
+        self.active = self.active | {key: clock}
+
+    def came(self, key: str) -> None:
+        """The turn of its message has come: one that comes once is over."""
+        if key in self.active and not self.active[key][2]:
+            self.drop(key)
+
+    def drop(self, key: str) -> None:
+        """Its message does not come any more."""
+        self.active = {other: clock for other, clock in self.active.items() if other != key}
 
     def key_for(self, clock: Clock, where: str) -> str:
         """The key of a timer that a hook wants. If one that runs says the same, it is that one.
@@ -89,7 +109,7 @@ class HookTimers:
         So `on_start` may set its timers at each life. Another one is named by what it says: the next life that begins
         at the same state gives it the same name, whatever else its hook does.
 
-        >>> timers = HookTimers({"3.1": ("Tick", b"", 1.0)})
+        >>> timers = LifeTimers(running={"3.1": ("Tick", b"", 1.0)})
         >>> [timers.key_for(("Tick", b"", 1.0), "5start") for _ in range(2)]
         ['3.1', '5starte37cb9c8.1']
         """

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 import hashlib
 import random
 from collections.abc import Awaitable, Callable, Generator
@@ -26,13 +25,15 @@ from ...actors.errors import (
 from ...actors.exit_reasons import NORMAL, ExitReason, pack_exit
 from ...actors.kernel.actor import Actor
 from ...actors.kernel.cell import Cell
-from ...actors.kernel.context import ActorContext, StashError
+from ...actors.kernel.context import NO_MESSAGE, ActorContext, StashError
 from ...actors.kernel.envelope import Ask, Item, ReplyHandle
 from ...actors.kernel.links import Monitor
 from ...actors.kernel.message import Message, message_name, require_message
 from ...actors.kernel.ref import ActorRef, current
+from ...actors.kernel.timers import Timer
 from ...actors.seconds import check_seconds
 from ...actors.values import encode_value
+from ...actors.values.saved_refs import Kept
 from ..protocol import REPLY, SINCE_THEN, Answer, EndWanted, Feed, Perform, Performed, PipeDone
 from ..turn_word import WAITS
 from .life_state import Asked
@@ -47,43 +48,82 @@ R = TypeVar("R")
 A = TypeVar("A", bound=Actor)
 
 
-@dataclasses.dataclass(frozen=True)
-class RecordedReplyHandle(ReplyHandle[R]):
-    """The right to answer one ask of a recorded actor later; it may be kept in a key variable."""
+class KeptHandle(Kept):
+    """A handle of a recorded actor, which may be kept in a key variable. Equal if it is on the same."""
+
+    __slots__ = ("id",)
+
+    def __init__(self, id: object) -> None:
+        self.id = id
+
+    def __eq__(self, other: object) -> bool:
+        return self.id == other.id if isinstance(other, KeptHandle) and type(other) is type(self) else NotImplemented
+
+    def __hash__(self) -> int:
+        return hash(self.id)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}(id={self.id!r})"
+
+
+class RecordedReplyHandle(KeptHandle, ReplyHandle[R]):
+    """The right to answer one ask of a recorded actor later."""
+
+    __slots__ = ()
 
     id: int
 
     def reply(self, value: R) -> None:
-        """Answer, from a turn of the same actor."""
         life = _own_life("answers later")
         # What was declared is not known here: sets are looked for.
-        answer = life.answer_value(value, set, "what it has answered later")
-        life.put("reply", str(self.id), f"{answer.kind}|{answer.name}", answer.body)
+        self._answer(life, life.answer_value(value, set, "what it has answered later"))
 
     def fail(self, error: HoldfastError) -> None:
-        """Answer with a Refusal or another typed error, from a turn of the same actor."""
         life = _own_life("answers later")
-        answer = life.answer_error(error)
+        self._answer(life, life.answer_error(error))
+
+    def _answer(self, life: Life, answer: Answer) -> None:
         life.put("reply", str(self.id), f"{answer.kind}|{answer.name}", answer.body)
 
 
 def _own_life(what: str) -> Life:
     """The life whose turn or hook this is."""
+    return _own_context(what).acting()
+
+
+def _own_context(what: str) -> RecordedContext:
+    """The context of the actor whose code this is."""
     ctx = current.get(None)
     if not isinstance(ctx, RecordedContext):
         raise HoldfastError(f"a recorded actor {what} from one of its own turns")
-    return ctx.acting()
+    return ctx
 
 
-@dataclasses.dataclass(frozen=True)
-class RecordedTimer:
-    """A handle on a timer of a recorded actor, whose clock runs at its home; it may be kept in a key variable."""
+class RecordedTimer(KeptHandle, Timer):
+    """A handle on a timer of a recorded actor, whose clock runs at its home."""
+
+    __slots__ = ()
 
     id: str
 
+    @property
+    def is_active(self) -> bool:
+        return self.id in _own_context("looks at its timers").recorded.timers.active
+
     def cancel(self) -> None:
-        """The message does not come any more, not even one that is queued already."""
         _own_life("cancels its timers").cancel_timer(self.id)
+
+
+class RecordedMonitor(KeptHandle, Monitor):
+    """A handle on a watch that the home keeps."""
+
+    __slots__ = ()
+
+    id: tuple[str, str]  # how the watch is ended, and whom it is over
+
+    def cancel(self) -> None:
+        verb, path = self.id
+        _own_life("stops watching").put(verb, path)
 
 
 class OutcomeFuture(asyncio.Future[T]):
@@ -320,6 +360,7 @@ class RecordedContext(ActorContext):
         name, body = message_name(type(message)), self._cell.node.codec.encode_alike(message, self.path)
         in_turn = life.feed is not None
         key = f"{life.turn}.{life.last_k + 1}" if in_turn else life.timer_of_hook(name, body, interval)
+        life.timers.set(key, (name, body, interval))
         life.put("timer", key, name, body, seconds=delay, interval=interval)
         return RecordedTimer(key)
 
@@ -438,8 +479,8 @@ class RecordedContext(ActorContext):
 
     def stash(self) -> None:
         fed, life = self._item, self.recorded
-        if not isinstance(fed, Fed) or life.feed is None:
-            raise StashError(f"{self.path}: only a message can be stashed")
+        if not isinstance(fed, Fed) or life.feed is None or fed.message is None:
+            raise StashError(f"{self.path}: {NO_MESSAGE}")
         if fed.is_stashed:
             raise StashError(f"{self.path}: this message is stashed already")
         fed.is_stashed = True
@@ -457,11 +498,11 @@ class RecordedContext(ActorContext):
 
     def monitor(self, other: ActorRef[Any]) -> Monitor:
         self.acting().put("monitor", other.path)
-        return RecordedMonitor(self._cell, other._cell, for_good=False)
+        return RecordedMonitor(("demonitor", other.path))
 
     def watch(self, other: ActorRef[Any]) -> Monitor:
         self.acting().put("watch", other.path)
-        return RecordedMonitor(self._cell, other._cell, for_good=True)
+        return RecordedMonitor(("unwatch", other.path))
 
     def link(self, other: ActorRef[Any]) -> None:
         self.acting().put("link", other.path)
@@ -564,17 +605,9 @@ def _in_background() -> bool:
     return task is not None and task.get_name() != "holdfast runner"
 
 
-class RecordedMonitor(Monitor):
-    """A handle on a watch that the home keeps."""
-
-    __slots__ = ()
-
-    def cancel(self) -> None:
-        """No further DOWN is admitted after the turn in hand."""
-        self.active = False
-        _own_life("stops watching").put("unwatch" if self.for_good else "demonitor", self.target.path)
-
-
 def once_more(feed: Feed) -> Feed:
     """The same input, to be handled in a turn of its own."""
-    return Feed(feed.id, -1, feed.kind, feed.name, feed.body, feed.time, feed.sender, feed.is_ask, feed.chain)
+    return Feed(
+        feed.id, -1, feed.kind, feed.name, feed.body, feed.time, feed.sender,
+        feed.is_ask, feed.chain, deadline=feed.deadline,
+    )  # fmt: skip

@@ -41,7 +41,7 @@ class Fed(Item, msgspec.Struct, eq=False):
         life: Life = item.life
         feed: Feed = item.feed
         life.open_turn(feed)
-        if feed.deadline and feed.turn < 0 and life.cell.node.clock.is_past(feed.deadline):
+        if feed.deadline and feed.turn < 0 and not feed.has_begun and life.cell.node.clock.is_past(feed.deadline):
             life.close_turn(DROPPED, NO_ANSWER)  # Nobody waits any more.
             return None
         if item.message is None and feed.name:
@@ -210,7 +210,10 @@ class GoLive(Hook):
     def run(actor: Any, item: Any) -> object:
         # Turns that failed are not replayed, but their numbers are used.
         item.life.turn = max(item.life.turn, item.go.turn)
-        item.life.timers.running = dict(item.go.timers)
+        timers = item.life.timers
+        for key in item.go.spent:
+            timers.came(key)
+        timers.running = dict(item.go.timers or timers.active)
         if item.go.recovered and type(actor).on_recovered is not Actor.on_recovered:
             item.life.hook_changes()
             return Hook.run(actor, item)

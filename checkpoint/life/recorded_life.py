@@ -73,7 +73,7 @@ from ..snapshot.image_writer import Imaging
 from ..snapshot.key_variables import check_keys, restore_state, save_state, variables
 from .determinism_guard import DeterminismGuard
 from .glances import answer_beside
-from .life_state import Asked, Awaited, HookTimers, LifeStage, RestoredState, SnapshotState, TurnWaits
+from .life_state import Asked, Awaited, LifeStage, LifeTimers, RestoredState, SnapshotState, TurnWaits
 from .outcome_order import OutcomeOrder, is_given_up
 from .readonly_guard import check_readonly
 from .recorded_context import Pending, RecordedContext
@@ -126,7 +126,7 @@ class Life:
         self.hook = ""  # the hook that runs, if it is one that is no turn
         self.guard = DeterminismGuard() if method.strict else None
         self.restored = RestoredState()
-        self.timers = HookTimers()
+        self.timers = LifeTimers()
         self.saving = SnapshotState()
         self.stage = LifeStage()
         self.images = Imaging(self, may_fork=may_fork)
@@ -230,7 +230,7 @@ class Life:
                 self.image_lost()  # The next one that is due is taken.
             case Restore():
                 self.restored.take(record)
-                self.timers.running.update(record.timers)
+                self.timers.take(record.timers)
             case _:
                 pass  # for whoever begins lives
 
@@ -328,6 +328,8 @@ class Life:
             self.turn += 1
         if self.returned:
             self.returned.pop(feed.id, None)  # It has come again: its feed may have been here before it was put back.
+        if feed.spent or feed.kind == TICK:
+            self.note_timers(feed)
         self.feed, self.last_k, self.stage.ending = feed, 0, None
         waits = self.waits
         waits.moment, waits.resting = 0.0, 0
@@ -339,6 +341,11 @@ class Life:
             self.outs = []
         if self.page is not None:
             self.page[0] = feed.id + 1
+
+    def note_timers(self, feed: Feed) -> None:
+        """The message of a timer has come, in this turn or in those before it that are left out."""
+        for key in (*feed.spent, feed.origin) if feed.kind == TICK else feed.spent:
+            self.timers.came(key)
 
     def mark(self, how: int = 0) -> None:
         """Say on the page that the turn in hand is at work, or (WAITS) that it waits."""
@@ -481,6 +488,7 @@ class Life:
         """Ticks that are queued here, or on their way, are dropped here and at home."""
         self.put("cancel", key)
         self.timers.cancelled.add(key)
+        self.timers.drop(key)
         self._drop(lambda feed: feed.kind == TICK and feed.origin == key and feed.turn < 0)
 
     def drop_queued(self, number: int) -> None:
@@ -538,6 +546,7 @@ class Life:
         stage = self.stage
         first = self.returned.pop(stage.begun, None)
         if first is not None:
+            first.feed.has_begun = True
             self.returned = {stage.begun: first} | self.returned
             stage.begun = -1
 

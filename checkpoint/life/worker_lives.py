@@ -177,7 +177,12 @@ class GuestKeeper:
         self._say("dismissed", path, below=below, for_good=for_good)
 
     def note(self, key: str, value: bytes | None) -> None:
-        """Keep the fact that a supervisor has a child; None forgets it."""
+        """Keep the fact that a supervisor has a child; None forgets it. Other facts are kept until the process ends."""
+        if not key.startswith(CHILDREN):
+            self._notes.pop(key, None)
+            if value is not None:
+                self._notes[key] = value
+            return
         self._forget_note(key)
         if value is not None:
             self.learn({key: value}, [])
@@ -186,6 +191,10 @@ class GuestKeeper:
     def notes(self, prefix: str) -> dict[str, bytes]:
         """The facts whose keys begin so, oldest first."""
         return {key: value for key, value in self._notes.items() if key.startswith(prefix)}
+
+    def noted(self, key: str) -> bytes | None:
+        """The fact of that name, or None."""
+        return self._notes.get(key)
 
 
 class Port:

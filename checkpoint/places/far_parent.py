@@ -15,7 +15,7 @@ import msgspec
 
 from ...actors.control.orders_lane import QueuedOrder, send_call
 from ...actors.errors import HoldfastError, StartFailed, StartIgnored
-from ...actors.exit_reasons import KILLED, ExitReason, pack_exit, unpack_exit
+from ...actors.exit_reasons import ExitReason, pack_exit, unpack_exit
 from ...actors.kernel import lifecycle, links
 from ...actors.kernel.actor import Start
 from ...actors.kernel.address_host import AddressHost, Parent, Place
@@ -203,7 +203,7 @@ class FarParent(Parent):
             self._end_unwanted(reason, recovers=True)
         else:
             running = self.below.place.running(self.cell)
-            is_blameless = reason == KILLED or blamed(worker.page[self.slot], one_works=one_works) < 0
+            is_blameless = reason.blames_nobody or blamed(worker.page[self.slot], one_works=one_works) < 0
             self._over_below(reason, running, ordered=is_blameless, noticed=worker.end.noticed_at)
 
     # -- the end of a life ------------------------------------------------------------------------------------------

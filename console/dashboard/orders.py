@@ -171,7 +171,7 @@ async def _transact(answers: Answers, order: PageOrder, rows: list[ActorRow]) ->
 
 
 def _told(told: dict[str, Any]) -> OrderDone:
-    steps = [str(step[3]) for step in told["steps"]]
+    steps = [": ".join(filter(None, map(str, step[3:]))) for step in told["steps"]]
     return OrderDone(steps=steps, difference=list(told["difference"]), lost=list(told["lost"]))
 
 

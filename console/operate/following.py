@@ -77,6 +77,10 @@ def trace(
         if others:
             raise ended("trace", f"{path} means {1 + len(others)} actors: name the one to follow", FAILED)
         remote.follow(row.path)
+        if row.turn:
+            typer.echo(
+                f"its turn of {row.turn} has run for {row.turn_seconds:.0f} s: only what it sends is shown", err=True
+            )
         while until is None or time.monotonic() < until:
             told = remote.next_events(SLICE if until is None else max(0.01, min(SLICE, until - time.monotonic())))
             for event in told["events"]:

@@ -11,8 +11,10 @@ from typing import Annotated, Any
 import msgspec
 import typer
 
+from ...actors.errors import AskTimeout
 from ...system.history.paths import literal
 from ..overview import ActorRow, ProcessUse, SystemLook
+from ..remote import RemoteSystem
 from ..runtime_folder import found_sockets, sweep
 from .patterns import select
 from .reaching import (
@@ -36,6 +38,10 @@ from .reaching import (
 COLOURS = {"running": "green", "suspended": "yellow", "restarting": "magenta", "starting": "magenta", "stopped": "red"}
 MEASURED = 0.2
 """Seconds over which the processor's use is measured."""
+STATE_WITHIN = 5.0
+"""Seconds in which an actor tells its state"""
+BUSY_WITHIN = 0.5
+"""or, if a turn of it is in hand: it is told between two turns."""
 
 
 def ls(as_json: Json = False) -> None:
@@ -203,13 +209,26 @@ def inspect(
         found = [_measured(remote.inspect(path), one, time.monotonic() - begun) for path, one in before.items()]
         for one in found:
             if with_state and one["actor"]["pid"]:
-                path = one["actor"]["path"]
-                one["state"] = remote.state(path) if as_json else asyncio.run(remote.outline(path))
+                _put_state(remote, one, as_json=as_json)
     if as_json:
         show_json(found)
-        return
-    for number, one in enumerate(found):
-        typer.echo(("\n" if number else "") + "\n".join(inspection_lines(one)))
+    else:
+        for number, one in enumerate(found):
+            typer.echo(("\n" if number else "") + "\n".join(inspection_lines(one)))
+    if any("no_state" in one for one in found):
+        raise typer.Exit(FAILED)
+
+
+def _put_state(remote: RemoteSystem, one: dict[str, Any], *, as_json: bool) -> None:
+    """With its state, or with what keeps it from being told."""
+    row = one["actor"]
+    path, within = row["path"], BUSY_WITHIN if row["turn"] or row["state"] == "silent" else STATE_WITHIN
+    try:
+        one["state"] = (
+            remote.state(path, timeout=within) if as_json else asyncio.run(remote.outline(path, timeout=within))
+        )
+    except AskTimeout as late:
+        one["no_state"] = f"not to be had, for {late.turn or 'it does not answer'}"
 
 
 def _measured(one: dict[str, Any], before: dict[str, Any], seconds: float) -> dict[str, Any]:
@@ -230,8 +249,9 @@ def inspection_lines(one: dict[str, Any]) -> Iterator[str]:
     yield f"life: {one.get('life', '-')} ({row['restarts']} restarts)"
     yield f"queued: {row['queued']}"
     if row["turn"]:
+        at = f", at {one['turn_at']}" if one.get("turn_at") else ""
         rests = f"; it {one['turn_rests']}" if one.get("turn_rests") else ""
-        yield f"turn: {row['turn']}, for {row['turn_seconds']:.1f} s{rests}"
+        yield f"turn: {row['turn']}, for {row['turn_seconds']:.1f} s{at}{rests}"
     yield f"recovery: {row['recovery'] or 'none'}"
     yield f"protection: {protection_text(one.get('protection'))}"
     for name in ("names", "links", "monitors"):
@@ -252,6 +272,8 @@ def inspection_lines(one: dict[str, Any]) -> Iterator[str]:
     if "state" in one:
         for name, text in one["state"].items():
             yield f"state {name}: {printable(text)}" if name else f"state: {printable(text)}"
+    if "no_state" in one:
+        yield f"state: {one['no_state']}"
 
 
 def protection_text(found: dict[str, Any] | None) -> str:

@@ -16,6 +16,13 @@ from ...system.upgrade.new_program import find_in
 from ..remote import RemoteChange, RemoteRef, RemoteSystem
 from .reaching import FAILED, GREETING_SECONDS, UNUSABLE, chosen, ended, told
 
+SENDS = ("ask", "tell", "send")
+"""What a ref of the program itself has, and that of a script has not."""
+NO_MESSAGES = (
+    "a script sends no messages, so that its refs have no '{name}': it looks, controls and changes. What has to send "
+    "some runs in the program: as the same file, by `await system.apply(...)`, or by an endpoint of your own"
+)
+
 
 def run_script(script: Path, system: str | None, socket: Path | None, *, dry_run: bool, timeout: float) -> None:
     """Run a reconfiguration script against a running system, and show what each of its transactions has done."""
@@ -63,11 +70,14 @@ def _line(script: Path, error: Exception) -> str:
 
 def _missing(of: RemoteChange | RemoteRef | RemoteSystem, name: str | None) -> str:
     """What a script has called that there is not, and what there is."""
+    if isinstance(of, RemoteRef) and name in SENDS:
+        return NO_MESSAGES.format(name=name)
     what = {RemoteChange: "a transaction", RemoteRef: "an actor", RemoteSystem: "the system"}[type(of)]
     there = sorted(one for one in dir(of) if not one.startswith("_"))
     close = difflib.get_close_matches(name or "", there, 1)
     meant = f"; did you mean {close[0]}?" if close else "."
-    return f"{what} has no {name!r} in a script{meant} There are {', '.join(there)}"
+    listed = f"There are {', '.join(there)}" if len(there) > 1 else f"There is {there[0]}, and nothing else"
+    return f"{what} has no {name!r} in a script{meant} {listed}"
 
 
 def _show(change: RemoteChange) -> None:

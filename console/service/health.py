@@ -13,11 +13,14 @@ from types import TracebackType
 from typing import Final
 
 from ...actors.errors import HoldfastError, SpecError
+from ...actors.kernel.cell import Cell
+from ...actors.kernel.ref import ActorRef
 from ...actors.seconds import check_seconds
 from ...checkpoint.journal import StoreInUse
 from ...supervision.admin import CountChildren
 from ...supervision.supervisor import Supervisor
 from ...system.system import ActorSystem
+from ..overview import silent_at_root
 from .notify import Notifier
 from .probe_server import ProbeServer
 
@@ -220,7 +223,8 @@ class Service:
             return [*problems, f"the root does not answer: {error}"]
         if counts.active < counts.specs:
             problems.append(f"{counts.specs - counts.active} of {counts.specs} children of the root do not run")
-        return problems
+        silent, waits = await asyncio.gather(silent_at_root(system), _waits(system, timeout))
+        return [*problems, *(f"the process of {path} does not answer" for path in silent), *waits]
 
     async def _probed(self, path: str) -> tuple[int, str] | None:
         """The answer to a probe; None: there is no such page."""
@@ -229,3 +233,23 @@ class Service:
             return None
         verdict = await looks[path]()
         return verdict.status, verdict.text
+
+
+async def _waits(system: ActorSystem, timeout: float) -> list[str]:
+    """Which supervisors have children that wait for somebody to whom they are bound, wherever in the tree they are."""
+    waiting = system._node.supervised.waiting
+    asked = sorted((cell for cell in waiting if not cell.is_dead), key=lambda cell: cell.path)
+    waiting.clear()  # First: whoever begins to wait meanwhile is among them again.
+    told = await asyncio.gather(*(_awaited(cell, timeout) for cell in asked))
+    waiting.update(cell for cell, found in zip(asked, told, strict=True) if found)
+    return [problem for found in told for problem in found]
+
+
+async def _awaited(cell: Cell, timeout: float) -> list[str]:
+    supervisor = ActorRef[Supervisor](cell)
+    try:
+        counts = await supervisor.ask(CountChildren(), timeout)
+    except HoldfastError as error:
+        return [f"{cell.path}, whose children have waited for others, does not answer: {error}"]
+    awaited = sorted(counts.awaited.items())
+    return [f"{count} of {counts.specs} children of {cell.path} wait for {target}" for target, count in awaited]

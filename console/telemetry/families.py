@@ -32,6 +32,7 @@ FAMILIES: Mapping[str, Family] = {
     "holdfast_late_replies_total": Family("counter", "Replies that came when nobody waited any more"),
     "holdfast_dead_letters_total": Family("counter", "Messages that nobody has handled"),
     "holdfast_refused_total": Family("counter", "Messages answered with no, held ones refused, frames", ("what",)),
+    "holdfast_no_room_total": Family("counter", "Refused or lost for want of room", ("where", "class")),
     "holdfast_events_total": Family("counter", "Events of the system, by kind", ("event",)),
     "holdfast_crashes_total": Family("counter", "Lives that user code has ended, by type of the error", ("error",)),
     "holdfast_restarts_total": Family("counter", "Restarts by supervisor and exit reason", ("supervisor", "reason")),

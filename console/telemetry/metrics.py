@@ -234,6 +234,7 @@ def _fill_look(out: Filled, look: _Look) -> None:
     out.put("holdfast_asks_outstanding", found.asks)
     out.put("holdfast_late_replies_total", look.late_replies)
     out.put("holdfast_dead_letters_total", look.dead_letters)
+    out.put_all("holdfast_no_room_total", found.no_room)
     out.put("holdfast_quarantined_messages", found.quarantined)
     out.put("holdfast_recorded_actors", found.recorded)
     out.put("holdfast_journal_bytes", found.journal_bytes)

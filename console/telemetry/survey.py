@@ -54,6 +54,8 @@ class Survey:
     """Actors whose statistics are on."""
     protected: Counter[tuple[str, bool]] = dataclasses.field(default_factory=Counter[tuple[str, bool]])
     """By mechanisms, outermost first, and whether all replicas are there."""
+    no_room: Counter[tuple[str, ...]] = dataclasses.field(default_factory=Counter[tuple[str, ...]])
+    """Messages and children for which there was no room so far, by what was full and class."""
     recorded: int = 0
     journal_bytes: int = 0
     journal_inputs: int = 0
@@ -129,6 +131,8 @@ async def survey(root: Cell, homes: Homes, classes: Labels, chosen: Sequence[str
         found.journal_inputs += len(switch.ledger.open)
         await pace.step()
     found.quarantined = homes.quarantine.count
+    for (where, kind), count in root.node.numbers.no_room.items():
+        found.no_room[where, named.of(kind)] += count
     found.asks = len(root.node.deadlines.waiting())
     pace.pause()
     return found

@@ -6,6 +6,7 @@ import msgspec
 
 from ...actors.kernel.message import Message, Refusal
 from ...checkpoint.protocol import (
+    Clock,
     Closed,
     Feed,
     GivenUp,
@@ -235,6 +236,7 @@ class ServerState(msgspec.Struct, array_like=True, tag=1):
     traps: bool = False  # `ctx.trap_exits`
     absent: list[str] = []  # variables that `__init__` has made, and that are no more
     variables: list[str] = []  # that the class had which has saved it, if that was another version, perhaps
+    timers: dict[str, Clock] = {}  # those whose messages may still come
 
 
 class StateDelta(msgspec.Struct, array_like=True, tag=2):
@@ -254,6 +256,7 @@ class StateDelta(msgspec.Struct, array_like=True, tag=2):
     stash_ids: list[int] = []
     traps: bool = False
     absent: list[str] = []
+    timers: dict[str, Clock] | None = None  # None: those of the state after turn `base`
 
 
 class Lead(Message[int]):

@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 
 from ...actors.kernel.message import Message
-from ...checkpoint.protocol import TurnEnd
+from ...checkpoint.protocol import Clock, TurnEnd
 from ..model.mechanism import Description
 
 
@@ -47,6 +47,7 @@ class Install(Message[None]):
     log: list[tuple[str, int, int, TurnEnd]]
     traps: bool = False  # `ctx.trap_exits` of the life that it comes from
     variables: tuple[str, ...] = ()  # that its class had when it was saved
+    timers: dict[str, Clock] = msgspec.field(default_factory=dict)  # that ran then
 
 
 class SetPeer(Message[None]):

@@ -323,7 +323,8 @@ class RequestProtocol(Transfer):
             await server.drop_life()
             stash, traps, variables = message.stash, message.traps, list(message.variables)
             image = image_from(data)
-            server.install(ServerState(message.turn, image, [], [], [], False, stash, traps, variables=variables))
+            state = ServerState(message.turn, image, [], [], [], False, stash, traps, [], variables, message.timers)
+            server.install(state)
             self._standing.log.replace(message.log)
 
     @on(Lead)

@@ -41,7 +41,7 @@ class OtherReplica:
         self.state: PeerState = "none"
         self.turn = -2  # the last turn whose state it has acknowledged, -2 if that is not known
         self.forwarded: list[asyncio.Task[bool]] = []  # batches on their way to it
-        self.missed_by = ""  # who has told that there is no other one, since there was one
+        self.is_missed = False  # there has been one, and that there is none now was not told yet
         self.told = 0  # how often home has said who it is
         self._bricks: dict[str, Outbox] = {}  # by slot
         self._waiting: set[asyncio.Future[Any]] = set()
@@ -65,7 +65,7 @@ class OtherReplica:
 
     def caught_up(self) -> None:
         """It counts from now on."""
-        self.state, self.missed_by = "live", ""
+        self.state, self.is_missed = "live", True
 
     def brick(self, slot: str) -> Outbox | None:
         """The way to the same brick there, if that was found already."""
@@ -202,11 +202,12 @@ class Standing:
     def go_on_alone(self, numbers: Iterable[int]) -> None:
         """What these requests came to leaves, and no other replica could give it again. Told once, until there is one.
 
-        What a start came to is no loss: whoever starts in its place begins with the same.
+        Before the first other one has joined nothing is lost, nor is what a start came to: whoever starts in its place
+        begins with the same.
         """
         inside = (self.inside[number] for number in numbers if number in self.inside)
-        if self.other.missed_by != self.path and any(one.feed.kind != START for one in inside):
-            self.other.missed_by = self.path
+        if self.other.is_missed and any(one.feed.kind != START for one in inside):
+            self.other.is_missed = False
             self.node.emit(ProtectionLost(self.address, self.path, self.epoch))
 
     def part(self, name: str) -> Cell:

@@ -17,7 +17,7 @@ import msgspec
 
 from ...actors.backoff import Backoff
 from ...actors.errors import HoldfastError, StartFailed
-from ...actors.exit_reasons import KILLED, ExitReason, pack_exit, unpack_exit
+from ...actors.exit_reasons import KILLED, ExitReason, crash, pack_exit, unpack_exit
 from ...actors.kernel import lifecycle
 from ...actors.kernel.actor import Start
 from ...actors.kernel.address_host import AddressHost, Parent, Place
@@ -66,7 +66,8 @@ FINISHED_WITHIN = 3600.0
 """Seconds that `on_stop` may take; whoever has ordered the end keeps the time."""
 REPLICA_SHUTDOWN = 20.0
 """Seconds that a replica may take to end its bricks, before its process is killed."""
-REPLICA_BACKOFF = Backoff(initial=0.01, maximum=2.0, reset_after=5.0)
+REPLICA_BACKOFF = Backoff(initial=0.01, maximum=0.8, reset_after=1.0)
+"""Waits before a replica is started again: with jitter less than a second, for the last one may be alone meanwhile."""
 BUILT_WITHIN = 60.0
 """Seconds that the processes of a group may take to come up."""
 BRICKS_FLAGS = Flags(intensity=100, period=5.0)
@@ -107,6 +108,12 @@ class GroupPlace(Place):
         group = self.group
         leader = None if group is None else group.membership.primary
         return None if group is None or leader is None else group.replicas.worker_of(leader)
+
+    def known_as(self, cell: Cell) -> str:
+        """The address of the actor in the replica that leads."""
+        group = self.group
+        leader = None if group is None else group.membership.primary
+        return cell.path if group is None or leader is None else group.replicas.place(f"{leader}/server")
 
     def replica_states(self) -> dict[str, str]:
         """How each replica does; none while the actor is being recovered."""
@@ -402,10 +409,11 @@ class GroupPlace(Place):
                 pieces = [Restore(b"")]  # It begins afresh, but its turns are counted on.
             traps = traps or any(piece.traps for piece in pieces)
             variables = tuple(name for piece in pieces for name in piece.variables)
+            timers = {key: clock for piece in pieces for key, clock in piece.timers.items()}
             for index, piece in enumerate(pieces, 1):
                 is_last = index == len(pieces)
                 turn, stash = switch.ledger.state_turn, switch.ledger.stash
-                order = Install(known.epoch, turn, piece.data, stash, is_last, [], traps, variables)
+                order = Install(known.epoch, turn, piece.data, stash, is_last, [], traps, variables, timers)
                 await replicas.ask(first, order, LED_WITHIN)
             await replicas.ask(first, Lead(known.epoch, self.config), LED_WITHIN)
         except HoldfastError as error:
@@ -449,17 +457,21 @@ class GroupPlace(Place):
 
     def has_fallen(self, group: Group, why: str) -> None:
         """No replica is left that could lead: the life is over, and whose fault it was may be known."""
-        cell, replicas, delivery = group.replicas.cell, group.replicas, group.delivery
+        cell, delivery = group.replicas.cell, group.delivery
         if cell.host.place is not self:
             return  # It has never been its life: another one goes on.
         self._careful = set() if delivery.out is None else {one.feed.id for one in delivery.out.requests}
         if self._starting is not None and not self._starting.done() and not delivery.is_live:
             self._fail(group, why)
             return
-        cells = [replicas.cell_of(name) for name in group.membership.names]
-        ends = [None if one is None or one.more is None else one.more.reason for one in cells]
-        faults = [reason for reason in ends if reason is not None and not reason.is_clean]
-        self._begin_end(cell, faults[-1] if faults else ends[0] or KILLED, delivery.only_suspect_input())
+        ends = self._ends(group)
+        faults = [reason for reason in ends if not reason.is_clean]
+        self._begin_end(cell, [KILLED, *ends[:1], *faults][-1], delivery.only_suspect_input())
+
+    def _ends(self, group: Group) -> list[ExitReason]:
+        """How the replicas have ended last, in their order."""
+        cells = [group.replicas.cell_of(name) for name in group.membership.names]
+        return [one.more.reason for one in cells if one is not None and one.more is not None]
 
     def _parts_ended(self, group: Group) -> None:
         """The mechanism's supervisor has given up."""
@@ -547,12 +559,13 @@ class GroupPlace(Place):
     ) -> None:
         """End all replicas, then the life at the address."""
         noticed, copy = time.monotonic(), None if self.group is None else self.group.copies.newest
+        ends = [] if self.group is None else self._ends(self.group)
         await self.dismantle(cell)
         self._ending = None
         if cell.state is not RUNNING:
             return
         if failed is not None:
-            reason = KILLED
+            reason = next((end for end in (*ends, crash(failed)) if end.common_cause), KILLED)
         if not ordered:
             if isinstance(self.home, TransientHome):
                 self.home.copy = copy

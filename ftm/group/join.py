@@ -27,7 +27,7 @@ DEAF_AFTER = 2
 
 If it says nothing at all, the time that it got no processor, or may be going through its state, does not count.
 """
-FIRST_RETRY, LONGEST_RETRY = 0.02, 2.0
+FIRST_RETRY, LONGEST_RETRY = 0.02, 1.0
 """Seconds until a replica that could not join is tried again; doubled each time."""
 
 

@@ -10,8 +10,11 @@ import asyncio
 import dataclasses
 from typing import TYPE_CHECKING, Final, Literal
 
-from ...actors.errors import HoldfastError
+from ...actors.errors import HoldfastError, NotGranted, type_name
+from ...actors.events import ActorCrashed, Event
+from ...actors.exit_reasons import Crash
 from ...actors.kernel.message import message_name
+from ...supervision.spec import ChildSpec
 from ..bricks.brick_messages import NoReply, RequestDropped
 from ..bricks.replica_orders import Computes, Doing
 from ..events import MechanismSettled
@@ -36,6 +39,8 @@ LOOK_EVERY: Final = 1.0
 """Seconds between two looks at how it does."""
 LONGEST_PAUSE: Final = 60.0
 """Seconds until going back is tried again, if it could not be; doubled each time, from one second on."""
+NOT_GRANTED: Final = type_name(NotGranted)
+"""The error of an actor that gives an order to somebody whom it has neither started nor is bound to."""
 MISUSES: Final = {
     message_name(RequestDropped): "its bricks have let a request fall",
     message_name(NoReply): "its bricks have ended a request with what is no reply to it",
@@ -136,6 +141,9 @@ class Probation:
         self._conduct = Conduct(now, turn, members, turn, now, self._starved())
         self._timer = group.replicas.node.loop.call_later(LOOK_EVERY, self._look)
         self._asking: asyncio.Task[None] | None = None
+        spec = group.replicas.cell.spec
+        self._was_free = before is NOTHING and isinstance(spec, ChildSpec) and spec.isolation == "task"
+        group.replicas.node.events.add_sink(self._hear)
 
     def _now(self) -> float:
         return self._group.replicas.node.loop.time()
@@ -165,6 +173,16 @@ class Probation:
             self.why = why
             self._group.place.begin_going_back()
 
+    def _hear(self, event: Event) -> None:
+        """An actor that has lived in this process fails by an order that it could give here, and may not give there."""
+        path = self._group.replicas.path
+        match event:
+            case ActorCrashed(reason=Crash(type_name=name) as reason) if name == NOT_GRANTED and self._was_free:
+                if event.address.startswith(f"{path}/ftm/"):
+                    self.failed(f"it gives orders that a process may not give: {reason.text}")
+            case _:
+                pass
+
     def drops(self, end: TurnEnd) -> bool:
         """A brick has ended a request itself: whether that is asked of the stack before, since it was ended wrongly.
 
@@ -193,6 +211,7 @@ class Probation:
             return
         self._timer.cancel()
         node, path = self._group.replicas.node, self._group.replicas.path
+        node.events.remove_sink(self._hear)
         stacks = self.before if self.before is not NOTHING else (), self.layers
         was, now = (tuple(one.name for one in layers) for layers in stacks)
         event = MechanismSettled(path, was, now, is_kept, self.why or why, self._now() - self._begun)

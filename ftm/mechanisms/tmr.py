@@ -101,7 +101,7 @@ class Voting(Deciding):
         if present == 1:
             standing.go_on_alone(one.feed.id for one in requests)
             return own  # Nobody is left to vote with.
-        standing.other.missed_by = ""
+        standing.other.is_missed = True
         decided = vote(mechanism.voter, runs)
         if isinstance(decided, Undecided):
             return NoMajority(standing.address, decided.why)

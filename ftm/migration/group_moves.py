@@ -16,7 +16,7 @@ from ...actors.exit_reasons import unpack_exit
 from ...actors.kernel import mailbox
 from ...actors.kernel.cell import Cell
 from ...actors.kernel.envelope import Ask, Envelope, Item
-from ...actors.kernel.links import Down, Exit, Monitor
+from ...actors.kernel.links import Down, Exit, LifeMonitor
 from ...actors.kernel.mailbox import Bound
 from ...actors.kernel.message import message_name
 from ...actors.migration.luggage import let_come
@@ -399,7 +399,7 @@ def arrived(cell: Cell, kind: str, body: bytes) -> Exit | Down:
     source, reason = cell.node.cell_at(data["source"]), unpack_exit(data["reason"])
     if kind == EXIT:
         return Exit(source, reason)
-    return Down(Monitor(cell, source, for_good=data["verb"] == "watch"), reason, bool(data["recovering"]))
+    return Down(LifeMonitor(cell, source, for_good=data["verb"] == "watch"), reason, bool(data["recovering"]))
 
 
 def settle_in(side: Leaving) -> None:

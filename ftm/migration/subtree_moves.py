@@ -281,7 +281,7 @@ class FromSubtree(Leaving):
             else:
                 links.drop_watch(watch)  # It was kept when it came to that process.
         for path, for_good in told:
-            links.note_watch(links.Monitor(cell, cell.node.cell_at(path), for_good))
+            links.note_watch(links.LifeMonitor(cell, cell.node.cell_at(path), for_good))
 
     def _let_go(self, held: list[Any]) -> None:
         """What has waited here goes where the actor lives."""

@@ -17,9 +17,9 @@ from ...actors.kernel import lifecycle, links
 from ...actors.kernel.cell import RUNNING, Cell
 from ...actors.kernel.envelope import Ask, Item
 from ...actors.kernel.lifecycle import Stop
-from ...actors.kernel.links import Monitor
+from ...actors.kernel.links import LifeMonitor
 from ...actors.kernel.mailbox import Bound, Bounded
-from ...actors.kernel.timers import Timer
+from ...actors.kernel.timers import LoopTimer
 from ...actors.kernel.topics import Topics
 from ...actors.migration.here import Arrival
 from ...actors.migration.luggage import check_sendable, let_come, pack_rest
@@ -47,7 +47,7 @@ class PlainChild:
         self._held: list[Any] | None = None  # what has been sent to it here meanwhile
         self._owed: dict[int, Any] = {}  # the asks that it has promised to answer
         self._expected: list[int] = []  # the numbers that the root was given for them, while it may stay
-        self._watches: list[Monitor] = []  # those that its state holds
+        self._watches: list[LifeMonitor] = []  # those that its state holds
 
     def obey(self, step: str, told: dict[str, Any]) -> None:
         match step:
@@ -195,8 +195,8 @@ class PlainChild:
         if rest is None:
             return lambda actor: restore_owing(actor, told["state"], self._owed)
 
-        def watched(path: str, for_good: bool) -> Monitor:
-            self._watches.append(Monitor(cell, guest.node.cell_at(path), for_good))
+        def watched(path: str, for_good: bool) -> LifeMonitor:
+            self._watches.append(LifeMonitor(cell, guest.node.cell_at(path), for_good))
             return self._watches[-1]
 
         return lambda actor: unpack_life(actor, told["state"], rest, self._owed.__getitem__, watched)
@@ -254,7 +254,7 @@ class PlainChild:
             self._owed[number].is_ours(key)
         for name, body, left, interval in told["timers"] if not has_ended else ():
             message = cell.node.codec.decode(cell.table.kind_named(name), body)
-            Timer.unpacked(cell, message, max(0.0, left), interval or None, False)
+            LoopTimer.unpacked(cell, message, max(0.0, left), interval or None, False)
         self._take_ties_over(cell, told)
         respec(cell, Respec([]))
         let_come(cell, (*waiting, *held))
@@ -274,14 +274,14 @@ class PlainChild:
         for path, for_good in told["watches"]:  # The root keeps those that reach out of it, and tells of their ends.
             own, held = _taken_from(kept, path, for_good), _taken_from(self._watches, path, for_good)
             if own is None or held is not None:
-                links.note_watch(held or Monitor(cell, node.cell_at(path), for_good))
+                links.note_watch(held or LifeMonitor(cell, node.cell_at(path), for_good))
                 if own is not None:
                     links.drop_watch(own)
         for topic in told["topics"]:
             node.topics.subscribe(topic, cell)
 
 
-def _taken_from(watches: list[Monitor], path: str, for_good: bool) -> Monitor | None:
+def _taken_from(watches: list[LifeMonitor], path: str, for_good: bool) -> LifeMonitor | None:
     """Such a watch, out of the list; None if there is none."""
     found = next((one for one in watches if one.name == path and one.for_good is for_good), None)
     if found is not None:

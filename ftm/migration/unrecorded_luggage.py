@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from ...actors.errors import HoldfastError
 from ...actors.kernel.codec import Parcel
-from ...actors.kernel.envelope import Ask, Item, ReplyHandle
+from ...actors.kernel.envelope import Ask, AskHandle, Item
 from ...actors.kernel.message import message_name
 from ...actors.migration.luggage import lift, pack_items, refuse, unanswerable, unpack_items
 from ...actors.process.wire.peer import Peer, RelayedAsk
@@ -36,7 +36,7 @@ def save_owing(actor: Actor) -> tuple[bytes, dict[int, Ask]]:
     owed: dict[int, Ask] = {}
 
     def told(value: Any) -> Any:
-        if type(value) is not ReplyHandle:
+        if type(value) is not AskHandle:
             return value
         ask = value.ask
         if ask is None or ask.is_done:
@@ -67,7 +67,7 @@ def restore_owing(actor: Actor, data: bytes, owed: Mapping[int, Ask]) -> None:
             return value
         ask = owed.get(value.id)
         if ask is None:
-            return ReplyHandle[Any](None)
+            return AskHandle[Any](None)
         found.add(value.id)
         return actor.ctx._promise(ask)
 

@@ -26,6 +26,7 @@ def point_of(life: ServerLife, data: Image, deltas: list[bytes]) -> ServerState:
     return ServerState(
         life.turn, data, deltas, stash, [fed.feed for fed in life.returned.values()], life.is_live,
         [key for key in ids if all(feed.id != key for feed in stash)], life.cell.extra().trap_exits,
+        timers=life.timers.active,
     )  # fmt: skip
 
 
@@ -43,6 +44,7 @@ def take_up(life: ServerLife, point: ServerState, *, has_deltas: bool) -> None:
     for name in life.begun_names.intersection(point.absent):  # `__init__` has made it, a turn has deleted it.
         delattr(actor._state_root(), name)
     _apply_deltas(actor, point.deltas, has_deltas=has_deltas)
+    life.timers.take(point.timers)
     life.stash += _fed(life, point.stash)
     life.returned |= _returned(life, point)
 
@@ -65,7 +67,7 @@ def rewind_to(life: ServerLife, point: ServerState, names: set[str] | None, *, h
     if names is not None:
         for name in set(variables(actor)) - set(saved[2]):
             delattr(actor._state_root(), name)
-    life.cell.extra().trap_exits = point.traps
+    life.cell.extra().trap_exits, life.timers.active = point.traps, point.timers
     life.rewind(point.turn, _fed(life, point.stash), _returned(life, point))
 
 

@@ -446,7 +446,7 @@ class Server(lifecycle.HerePlace):
             if end is None:
                 life.to_life(feed)
             else:
-                queue.append(Skip(life, end))
+                queue.append(Skip(life, feed, end))
         self._put(last)
         return resting
 

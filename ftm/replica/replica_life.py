@@ -244,15 +244,16 @@ class PartOver(Item):
 class Skip(Item):
     """In place of a turn that has failed: its number is used, and it has left nothing else."""
 
-    __slots__ = ("end", "life")
+    __slots__ = ("end", "feed", "life")
 
-    def __init__(self, life: ServerLife, end: TurnEnd) -> None:
-        self.life, self.end = life, end
+    def __init__(self, life: ServerLife, feed: Feed, end: TurnEnd) -> None:
+        self.life, self.feed, self.end = life, feed, end
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
         life: ServerLife = item.life
         life.turn += 1
+        life.note_timers(item.feed)
         end: TurnEnd = item.end
         life.returned.pop(end.id, None)  # It may have been put back before: it is handled with that.
         life.port.to_home(TurnEnd(life.turn, end.id, end.status, [], end.answer, end.state, end.ends))

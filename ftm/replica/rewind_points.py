@@ -14,7 +14,7 @@ from typing import Final
 
 import msgspec
 
-from ...checkpoint.protocol import FAILED, TurnEnd
+from ...checkpoint.protocol import FAILED, Clock, TurnEnd
 from ..bricks.brick_messages import Request, ServerState, StateDelta
 from ..bricks.state_images import BLOCK, Misfit
 from ..bricks.state_images import patch as make_patch
@@ -147,6 +147,7 @@ def change_since(points: RewindPoints, turn: int) -> StateDelta | None:
     if turn <= points.untraced:
         return None
     patch, deltas = None, point.deltas
+    timers: dict[str, Clock] | None = point.timers
     at = _place_of(points, turn, point)
     if at is not None:
         deltas = point.deltas[at:]
@@ -155,6 +156,7 @@ def change_since(points: RewindPoints, turn: int) -> StateDelta | None:
         base = next((one for one in (points.given, before) if one is not None and one.turn == turn), None)
         if base is None:
             return None
+        timers = None if base.timers is point.timers else point.timers
         if base.data is point.data and _begins_with(point.deltas, base.deltas):  # It was taken back meanwhile.
             deltas = point.deltas[len(base.deltas) :]
         elif point.data.size <= BLOCK:
@@ -163,7 +165,7 @@ def change_since(points: RewindPoints, turn: int) -> StateDelta | None:
             patch = make_patch(base.data, point.data)
     return StateDelta(
         point.turn, turn, patch, deltas, checksum(deltas), point.stash, point.returned, point.live, point.stash_ids,
-        point.traps, point.absent,
+        point.traps, point.absent, timers,
     )  # fmt: skip
 
 
@@ -198,5 +200,6 @@ def led_to(point: ServerState | None, state: ServerState | StateDelta) -> Server
     if state.patch is not None:
         data, deltas = state.patch.applied(point.data), state.deltas
     return ServerState(
-        state.turn, data, deltas, state.stash, state.returned, state.live, state.stash_ids, state.traps, state.absent
-    )
+        state.turn, data, deltas, state.stash, state.returned, state.live, state.stash_ids, state.traps, state.absent,
+        timers=point.timers if state.timers is None else state.timers,
+    )  # fmt: skip

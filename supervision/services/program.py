@@ -85,6 +85,7 @@ class ProgramPlan:
     limits: Limits | None
     stdin: bool
     lines_to: str | None
+    log_lines: bool
 
 
 class Program(Actor):
@@ -191,7 +192,7 @@ class Program(Actor):
         self._parts.pop(stream, None)
         node = self.ctx._cell.node
         if node.events.hears_lines:
-            node.emit(LogLine(self.ctx.path, stream, text, self.ctx._cell.life))
+            node.emit(LogLine(self.ctx.path, stream, text, self.ctx._cell.life, self._order.log_lines))
         if self._sender is not None:
             self._sender.send(stream, text)
         if self._sign is not None:
@@ -342,6 +343,7 @@ def program(
     cwd: str | Path | None = None,
     stdin: bool = False,
     lines_to: ActorRef[Any] | str | None = None,
+    log_lines: bool = True,
     restart: Restart = "permanent",
     shutdown: Shutdown = 5.0,
     backoff: Backoff | None = None,
@@ -370,7 +372,10 @@ def program(
         cwd: its working directory.
         stdin: whether it reads what `ProgramInput` brings; else its standard input is empty.
         lines_to: who gets each line of its output as a `ProgramLine`: a ref, an address or a registered name. A hundred
-            that are not handled have the program wait. What nobody can take is a dead letter.
+            that are not handled have the program wait. The first ones are kept until the receiver is there, for ten
+            seconds and a thousand of them at most. What nobody can take is a dead letter.
+        log_lines: whether each line of its output is written to the log, too; `holdfast logs` shows the last ones in
+            any case.
         restart, backoff, significant, rules: as in `child`.
         shutdown: seconds it may take to end before it is ended by SIGKILL, "brutal_kill" or "infinity".
         limits: of the program itself; `hung_after` does not apply.
@@ -384,6 +389,8 @@ def program(
     check_seconds(where, "ready_timeout", ready_timeout)
     if not isinstance(stdin, bool):
         raise SpecError(where, f"stdin must be True or False, not {stdin!r}")
+    if not isinstance(log_lines, bool):
+        raise SpecError(where, f"log_lines must be True or False, not {log_lines!r}")
     if limits is not None and not isinstance(limits, Limits):
         raise SpecError(where, f"limits must be Limits(...) or left out, not {limits!r}")
     if limits is not None and limits.hung_after is not None:
@@ -402,6 +409,7 @@ def program(
         limits,
         stdin,
         receiver_in(where, lines_to),
+        log_lines,
     )
     # The actor does the counting, for a kill of the actor must not come before that of the program.
     own = child(

@@ -10,12 +10,14 @@ have ended meanwhile.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections import deque
 from typing import Any, Literal
 
 import msgspec
 
 from ...actors.errors import ActorStopped, HoldfastError
+from ...actors.events import StoreRefused
 from ...actors.exit_reasons import ExitReason
 from ...actors.kernel.actor import Actor, on
 from ...actors.kernel.cell import DOWN, GONE, Cell
@@ -23,6 +25,7 @@ from ...actors.kernel.envelope import Ask, ReplyHandle
 from ...actors.kernel.links import Monitor
 from ...actors.kernel.message import Message, Refusal
 from ...actors.kernel.ref import ActorRef
+from ...actors.persistence import ENTRIES, entries_key
 from ...actors.process.wire.peer import OutsideHost
 
 Keys = Literal["unique", "duplicate"]
@@ -124,6 +127,12 @@ class DeleteMeta(Message[None]):
     name: str
 
 
+class Returned(Message[None]):
+    """Somebody lives again at the address of a recorded holder that had ended."""
+
+    holder: str
+
+
 class KeyRegistered(Message[None]):
     """To listeners: `holder` holds `key` from now on."""
 
@@ -140,6 +149,13 @@ class KeyFreed(Message[None]):
     key: Any
     holder: ActorRef[Any]
     ended: bool
+
+
+class KeptKey(msgspec.Struct, frozen=True, array_like=True):
+    """An entry of a recorded actor as it is kept."""
+
+    key: bytes
+    value: Any
 
 
 @dataclasses.dataclass(slots=True, eq=False)
@@ -212,33 +228,95 @@ class RegistryActor(Actor):
         if not isinstance(book, Book):
             book = cell.node.kept[cell] = Book(dict(self._first_meta))
         self._book = book
+        self._awaited: set[str] = set()
         for holder, holdings in list(book.holders.items()):
             holdings.monitor.cancel()
             holdings.monitor = self.ctx.monitor(holder.ref)
             self._drop_dead(holder)
+        for key in cell.node.ports.keeper.notes(ENTRIES):
+            path, _, registry = key.removeprefix(ENTRIES).partition("\n")
+            if registry == cell.path:
+                self._take_back(path)
 
     # -- who holds what ---------------------------------------------------------------------------------------------
 
     @on(Register)
     def _register(self, message: Register) -> None:
-        """A unique key has one living holder; a later life of it may say it again."""
+        """A unique key has one living holder; a recorded one has one entry for a key, and may say it again."""
         holder = self._sender()
         if not is_living(holder, message.life):
             return  # Its ask has outlived it.
-        if self._is_unique:
-            for entry in list(self._book.keys.get(message.key, ())):
-                if not is_living(entry.holder, entry.life):
-                    self._remove(entry, ended=True)  # Its DOWN is still on the way.
-                elif entry.holder is holder and message.life == 0:
-                    entry.value = message.value
-                    return
-                else:
-                    raise KeyTaken(entry.holder.ref)
+        holdings = self._book.holders.get(holder)
+        for entry in () if holdings is None else holdings.entries:
+            if entry.key == message.key and 0 in (entry.life, message.life):
+                entry.life, entry.value = message.life, message.value
+                self._note(holder)
+                return
+        if (other := self._in_the_way(message.key)) is not None:
+            raise KeyTaken(other.holder.ref)
+        self._enter(message.key, holder, message.life, message.value)
+        if message.life == 0:
+            self._note(holder)
+
+    def _in_the_way(self, key: bytes) -> HeldKey | None:
+        """The entry of a living actor that has this key, if only one may have it."""
+        for entry in list(self._book.keys.get(key, ())) if self._is_unique else ():
+            if is_living(entry.holder, entry.life):
+                return entry
+            self._remove(entry, ended=True)  # Its DOWN is still on the way.
+        return None
+
+    def _enter(self, key: bytes, holder: Cell, life: int, value: Any) -> None:
         self._book.number += 1
-        entry = HeldKey(self._book.number, message.key, holder, message.life, message.value)
-        self._book.keys.setdefault(message.key, {})[entry] = None
+        entry = HeldKey(self._book.number, key, holder, life, value)
+        self._book.keys.setdefault(key, {})[entry] = None
         self._holdings(holder).entries[entry] = None
-        self._tell_listeners(KeyRegistered(self.ctx.ref, key_of(entry.key), holder.ref, entry.value))
+        self._tell_listeners(KeyRegistered(self.ctx.ref, key_of(key), holder.ref, value))
+
+    # -- recorded holders -------------------------------------------------------------------------------------------
+
+    def _note(self, holder: Cell) -> None:
+        """Keep what a recorded actor holds: it is its own, as its state is, until it gives it up or is erased."""
+        node, holdings = self.ctx._cell.node, self._book.holders.get(holder)
+        if not node.ports.keeper.has_recorded(holder.path):
+            return  # It is of another system, or a replica.
+        entries = () if holdings is None else holdings.entries
+        kept = [KeptKey(entry.key, entry.value) for entry in entries if entry.life == 0]
+        try:
+            body = node.codec.encode(kept, self.ctx.path) if kept else None
+            node.ports.keeper.note(entries_key(holder.path, self.ctx.path), body)
+        except HoldfastError as error:
+            node.emit(StoreRefused(self.ctx.path, f"what {holder.path} holds is not kept: {error}"))
+
+    def _await(self, path: str) -> None:
+        """Have the entries of a recorded actor again as soon as somebody lives at its address."""
+        if path not in self._awaited:
+            self._awaited.add(path)
+            own = self.ctx._cell
+            own.node.awaited.setdefault(path, []).append(functools.partial(_tell_soon, own, Returned(path)))
+
+    @on(Returned)
+    def _returned(self, message: Returned) -> None:
+        """Whoever is there has what was kept for the address, unless that was erased."""
+        self._awaited.discard(message.holder)
+        self._take_back(message.holder)
+
+    def _take_back(self, path: str) -> None:
+        node = self.ctx._cell.node
+        body = node.ports.keeper.noted(entries_key(path, self.ctx.path))
+        if body is None:
+            return
+        holder = node.find(path)
+        if holder is None or holder.has_nobody:
+            self._await(path)
+            return
+        holdings = self._book.holders.get(holder)
+        held = set() if holdings is None else {entry.key for entry in holdings.entries}
+        for kept in node.codec.decode(list[KeptKey], body):
+            if kept.key not in held and self._in_the_way(kept.key) is None:
+                self._enter(kept.key, holder, 0, kept.value)
+
+    # -- reading ----------------------------------------------------------------------------------------------------
 
     @on(Find, readonly=True)
     def _find(self, message: Find) -> list[RegistryRow]:
@@ -280,6 +358,8 @@ class RegistryActor(Actor):
         for entry in self._book.keys.get(message.key, ()):
             if entry.number == message.number and entry.holder is holder:
                 entry.value = message.value
+                if entry.life == 0:
+                    self._note(holder)
                 return True
         return False
 
@@ -289,6 +369,8 @@ class RegistryActor(Actor):
         if not entries:
             del self._book.keys[entry.key]
         del self._book.holders[entry.holder].entries[entry]
+        if entry.life == 0 and not ended:
+            self._note(entry.holder)
         self._let_go(entry.holder)
         self._tell_listeners(KeyFreed(self.ctx.ref, key_of(entry.key), entry.holder.ref, ended))
 
@@ -355,6 +437,7 @@ class RegistryActor(Actor):
         """Let go what a holder held whose life is over, unless it is brought back with its state."""
         if not recovering:
             self._drop_dead(source._cell, told=True)
+            self._take_back(source.path)
 
     def _drop_dead(self, holder: Cell, *, told: bool = False) -> None:
         """Free what the ended lives of an actor held; if it was `told`, a stand-in has ended whatever it looks like."""
@@ -402,10 +485,20 @@ class RegistryActor(Actor):
                 node.dead_letter(cell, message, str(error))
 
 
+def _tell_soon(registry: Cell, message: Returned) -> None:
+    node = registry.node  # In nobody's turn; and whoever comes there is not started yet.
+    node.loop.call_soon(_tell, registry, message, context=node.base_context.copy())
+
+
+def _tell(registry: Cell, message: Returned) -> None:
+    if not registry.is_dead:  # Else the next one at its address looks for itself.
+        registry.ref.tell(message)
+
+
 def is_living(holder: Cell, life: int) -> bool:
     """Whether that life of an actor goes on; a recorded one (life 0) also while it is brought back."""
     if life == 0:
-        return not holder.is_dead
+        return not holder.has_nobody
     # A stand-in in another process counts no lives: there it takes the DOWN to know.
     return holder.state not in (DOWN, GONE) and holder.life in (0, life)
 

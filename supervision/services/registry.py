@@ -76,7 +76,8 @@ def registry(
 
     Args:
         name: the last part of its address.
-        keys: "unique": one holder per key; "duplicate": any number of entries, also several of one holder.
+        keys: "unique": one holder per key; "duplicate": any number of entries, also several of one holder that has no
+            recovery.
         listeners: addresses ("/app/audit") or registered names ("audit") of actors that get `KeyRegistered` and
             `KeyFreed`; who is not there at the time misses them.
         meta: values that belong to the registry itself, to begin with.
@@ -84,7 +85,7 @@ def registry(
 
     A restart of the registry loses nothing: its entries belong to its address. They are lost when the address is
     given up, say because its supervisor is restarted; put it first in a "rest_for_one" supervisor, then its holders
-    are restarted after it, and register again.
+    are restarted after it, and register again. What actors with recovery hold is kept with what is recorded of them.
 
     Raises:
         SpecError: naming the option and what it may be.
@@ -124,9 +125,11 @@ class Registry(Generic[K, V]):
     async def register(self, key: K, value: Any = None) -> None:
         """Hold a key from now on.
 
+        An actor with recovery holds it in all its lives, until it gives it up. It has one entry for a key: to say its
+        own again changes the value.
+
         Raises:
-            AlreadyRegistered: with unique keys, by another living actor or by this one. (An actor with recovery may
-                say its own again, which changes the value: it holds its keys over crashes.)
+            AlreadyRegistered: with unique keys, by another living actor, or by this one if it has no recovery.
             NotAnActor: it was not called by an actor.
         """
         packed = pack_key(key)

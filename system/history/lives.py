@@ -312,7 +312,7 @@ def _root_ended(lives: Lives, event: PastEvent) -> None:
 WITH_THE_ROOT = frozenset({"SystemStopped", "RootKilled"})
 """How lives end that end with the process of the root."""
 ROOT = ("SystemStarted", "SystemStopped")
-DEATHS = frozenset({"Signal", "Exited", "OutOfMemory", "Hung"})
+DEATHS = frozenset({"Signal", "ForkServerDied", "Exited", "OutOfMemory", "Hung"})
 """Exit reasons of a process that says nothing itself of what it had in hand."""
 LEARN = {
     "ActorStarted": _started,

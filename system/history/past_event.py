@@ -99,7 +99,7 @@ def plain_fields(event: Event, *, payloads: bool = False) -> dict[str, Plain]:
         if kind is int or kind is float or kind is bool or value is None:
             fields[name] = value
         elif kind is str:
-            fields[name] = shortened(_dotted(value) if name == "message" else value)
+            fields[name] = shortened(dotted(value) if name == "message" else value)
         elif isinstance(value, ExitReason):
             fields[name] = shortened(str(value))
             fields[f"{name}_kind"] = kind.__name__
@@ -121,7 +121,7 @@ def _names(kind: type[Event]) -> tuple[str, ...]:
     return kind.__struct_fields__[1:]
 
 
-def _dotted(name: str) -> str:
+def dotted(name: str) -> str:
     """The type of a message as people write it; homes know it by its wire name, `module:Class`."""
     return name.replace(":", ".", 1)
 
@@ -136,7 +136,7 @@ def content(value: object) -> str:
 
 def message_type(value: object) -> str:
     """The type of a message or of what brings it, also if its class is not known here."""
-    return _dotted(value.name) if isinstance(value, Parcel) else item_name(value)
+    return dotted(value.name) if isinstance(value, Parcel) else item_name(value)
 
 
 def _put_message(fields: dict[str, Plain], value: Any, *, payloads: bool) -> None:

@@ -14,6 +14,7 @@ from ..last_lines.line_memory import LineMemory
 from .authors import author
 from .counted_work import COUNTED, count_work
 from .forgetting import telling_of
+from .intake.alike import EVERY, AlikeCounter
 from .lives import LivesByAddress
 from .past_event import UNKEPT, PastEvent, Plain, plain_fields, shortened
 from .tracks import BOUNDS, EventTrack, TrackName, track_of
@@ -58,6 +59,8 @@ class HistoryRecorder:
         self._tracks = {name: EventTrack(bounds, node.loop.time()) for name, bounds in BOUNDS.items()}
         self._storm_since: float | None = None
         self._storm_timer: asyncio.TimerHandle | None = None
+        self._alike = AlikeCounter()
+        self._alike_timer: asyncio.TimerHandle | None = None
         self._expected: dict[str, tuple[str, str]] = {}
         self.followers = Followers()
         self._last = 0
@@ -83,7 +86,7 @@ class HistoryRecorder:
             self.lines.add_printed(event.address, event.stream, event.text, event.life)
             return
         kind = type(event)
-        if kind in UNKEPT or not self._admits(event, kind):
+        if kind in UNKEPT or self._is_counted(event) or not self._admits(event, kind):
             return
         fields = plain_fields(event, payloads=self.keeps_payloads)
         if kind in ENDS and event.address in self._expected:
@@ -95,6 +98,23 @@ class HistoryRecorder:
         if kind.__name__ in COUNTED:
             fields |= count_work(self._node, event.address)
         self._add(kind.__name__, event.address, fields)
+
+    def _is_counted(self, event: Event) -> bool:
+        """Whether an event is one of many that are alike: a row says in a while how many there were."""
+        now = self._node.loop.time()
+        if not self._alike.counts(event, now):
+            return False
+        name = track_of(type(event).__name__)
+        if not self._tracks[name].counts(now):
+            self._rest(RESTFUL.get(name), now)
+        if self._alike_timer is None:
+            self._alike_timer = self._later(EVERY, self._tell_alike)
+        return True
+
+    def _tell_alike(self) -> None:
+        self._alike_timer = None
+        for kind, address, fields in self._alike.take_rows():
+            self._add(kind, address, fields)
 
     def _admits(self, event: Event, kind: type[Event]) -> bool:
         now, name = self._node.loop.time(), track_of(kind.__name__)
@@ -172,6 +192,7 @@ class HistoryRecorder:
             self._writer.forget(lambda event: event.number in numbers)
         for track in self._tracks.values():
             track.ring.forget(lambda event: event.number in numbers)
+        self._alike.forget(top)
         self.lives.forget(top)
         self.lines.forget(top)
         for path in [path for path in self._expected if is_at(path, top)]:
@@ -207,8 +228,10 @@ class HistoryRecorder:
 
     def close(self) -> None:
         """The system has ended: say so, and have the store keep what it does not have yet."""
-        if self._storm_timer is not None:
-            self._storm_timer.cancel()
+        for timer in (self._storm_timer, self._alike_timer):
+            if timer is not None:
+                timer.cancel()
+        self._tell_alike()
         self._note("SystemStopped", {"why": "the system stopped"})
         if self._writer is not None:
             self._writer.close()

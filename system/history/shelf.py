@@ -9,8 +9,10 @@ import msgspec
 
 from .past_event import PastEvent
 
-CHUNK_BYTES = 32 * 1024
+CHUNK_BYTES = 8 * 1024
 """Bytes after which a note is left as it is, and the next one is begun."""
+PAGES_BYTES = 8 * 1024
+"""Bytes that a store writes for a note besides those in it, about: pages are written whole."""
 EVENTS = msgspec.msgpack.Decoder(list[PastEvent])
 
 
@@ -38,8 +40,8 @@ class EventShelf:
         last = self._sizes[-1][0].removeprefix(prefix) if self._sizes else ""
         self._next = int(last) + 1 if last.isascii() and last.isdigit() else 1
 
-    def put(self, events: Sequence[PastEvent]) -> None:
-        """Write these events behind the others.
+    def put(self, events: Sequence[PastEvent]) -> int:
+        """Write these events behind the others; returns how many bytes were written for them.
 
         Raises:
             HoldfastError: the store refuses; they may be put again, and those that it has taken are there twice then.
@@ -52,13 +54,15 @@ class EventShelf:
             if packed and size > self._most_bytes:
                 break
             packed.appendleft(one)
+        written = 0
         while packed:
             part = list(self._open)
             part_bytes = self._open_bytes
             while packed and (part_bytes < CHUNK_BYTES or not part):
                 part_bytes += len(packed[0])
                 part.append(packed.popleft())
-            self._put_part(part, part_bytes)
+            written += self._put_part(part, part_bytes)
+        return written
 
     def forget(self, notes: Mapping[str, bytes], is_meant: Callable[[PastEvent], bool]) -> None:
         """Write those of these notes anew that have an event which is meant, without it.
@@ -77,7 +81,7 @@ class EventShelf:
             if name == f"{self._prefix}{self._next:012d}":
                 self._open, self._open_bytes = left, sum(map(len, left))
 
-    def _put_part(self, part: list[msgspec.Raw], part_bytes: int) -> None:
+    def _put_part(self, part: list[msgspec.Raw], part_bytes: int) -> int:
         """Write the open note anew, with more in it; when it is full, the next one is opened."""
         name = f"{self._prefix}{self._next:012d}"
         data = msgspec.msgpack.encode(part)
@@ -92,6 +96,7 @@ class EventShelf:
         while len(self._sizes) > 1 and sum(size for _, size in self._sizes) > self._most_bytes:
             self._write(self._sizes[0][0], None)
             self._sizes.popleft()
+        return len(data) + PAGES_BYTES
 
 
 def events_in(notes: Mapping[str, bytes]) -> list[PastEvent]:

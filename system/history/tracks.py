@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Literal, NamedTuple, TypeAlias
 
+from .intake.quota import EventQuota
 from .past_event import PastEvent
-from .quota import EventQuota
 from .ring import EventRing
 
 TrackName: TypeAlias = Literal["rare", "others", "letters"]
@@ -39,6 +39,8 @@ BOUNDS: Mapping[TrackName, TrackBounds] = MappingProxyType(
         "letters": TrackBounds(1_000, MIB, 128 * 1024, 500, 50.0),
     }
 )
+COUNTED = 0.1
+"""What an event takes of the quota that is not recorded, but counted."""
 LETTERS = frozenset({"DeadLetter"})
 RARE = frozenset(
     {
@@ -110,6 +112,10 @@ class EventTrack:
     def admits(self, now: float, *, leaving: float = 0.0) -> bool:
         """Whether one more is recorded, if so large a part of the quota is to be left to others behind it."""
         return self._quota.take(now, least=max(1.0, leaving * self._burst))
+
+    def counts(self, now: float) -> bool:
+        """Whether one more is counted, which takes a tenth of what it takes to record it."""
+        return self._quota.take(now, cost=COUNTED)
 
     def is_quiet(self, now: float) -> bool:
         """Whether hardly anything has come lately."""

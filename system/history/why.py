@@ -164,6 +164,8 @@ def _fault(life: PastLife) -> str:
                 else ""
             )
             return f"its process was ended by {reason}{who}"
+        case "ForkServerDied":
+            return f"{reason}, as all others did: no fault of its own, and one restart for all of them"
         case "OutOfMemory":
             return f"its process was {reason}" if life.pid else reason
         case "Hung":

@@ -19,6 +19,10 @@ if TYPE_CHECKING:
 
 PACE = 0.25
 """Seconds between two writes while events come."""
+BURST_BYTES, BYTES_PER_SECOND = 512 * 1024, 8 * 1024
+"""Bytes that are written at that pace, and how many each second for as long as events go on after that."""
+LONGEST_PACE = 5.0
+"""Seconds between two writes at most, which is what a kill may take along."""
 RETRY = 30.0
 """Seconds until a store is tried again that has refused."""
 MOST_UNWRITTEN = 2_000
@@ -55,6 +59,27 @@ def stored(store: NoteStore) -> list[PastEvent]:
     return [by_number[number] for number in sorted(by_number)]
 
 
+class SpentBytes:
+    """How much was written lately: many events that go on for long are written more seldom, and more of them at once.
+
+    Args:
+        now: seconds on any clock that does not go back.
+
+    >>> spent = SpentBytes(0.0)
+    >>> spent.add(BURST_BYTES, 0.0), spent.add(BYTES_PER_SECOND, 0.0), spent.add(BURST_BYTES, 0.0)
+    (0.25, 1.0, 5.0)
+    """
+
+    def __init__(self, now: float) -> None:
+        self._bytes, self._then = 0.0, now
+
+    def add(self, written: int, now: float) -> float:
+        """So much was written just now; returns the seconds until the next write."""
+        self._bytes = max(0.0, self._bytes - (now - self._then) * BYTES_PER_SECOND) + written
+        self._then = now
+        return min(LONGEST_PACE, max(PACE, (self._bytes - BURST_BYTES) / BYTES_PER_SECOND))
+
+
 class HistoryWriter:
     """Writes past events to the store, beside the turns: soon after the first one, then a few times a second.
 
@@ -70,6 +95,7 @@ class HistoryWriter:
         self._unwritten: deque[PastEvent] = deque(maxlen=MOST_UNWRITTEN)
         self._timer: asyncio.TimerHandle | None = None
         self._due = 0.0  # the next write is not before
+        self._spent = SpentBytes(node.loop.time())
         self._has_failed = self._is_closed = False
 
     def add(self, event: PastEvent) -> None:
@@ -102,13 +128,13 @@ class HistoryWriter:
 
     def _write(self) -> None:
         self._timer = None
-        events = list(self._unwritten)
+        events, written = list(self._unwritten), 0
         self._unwritten.clear()
         try:
             for name, shelf in self._shelves.items():
                 wanted = [event for event in events if track_of(event.kind) == name]
                 if wanted:
-                    shelf.put(wanted)
+                    written += shelf.put(wanted)
         except HoldfastError as error:
             self._due = self._node.loop.time() + RETRY
             self._unwritten.extend(events)
@@ -117,8 +143,8 @@ class HistoryWriter:
                 self._has_failed = True
                 self._node.emit(HistoryNotKept(f"/{self._node.name}", str(error)))
         else:
-            self._has_failed = False
-            self._due = self._node.loop.time() + PACE
+            now, self._has_failed = self._node.loop.time(), False
+            self._due = now + self._spent.add(written, now)
 
     def close(self) -> None:
         """Write what is left; a store that refuses now is not told of any more."""

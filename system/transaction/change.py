@@ -13,7 +13,7 @@ from ...supervision.spec import ChildSpec, Isolation, Strategy
 from . import living
 from .living import Bind, RegisterName, Unbind, UnregisterName
 from .mechanisms import Isolate, OnProtection, Protect, Update
-from .operation import Operation, Step, text_of
+from .operation import Operation, Step, described_steps, text_of
 from .reparenting import Reparent
 from .running import Respecify, StartAgain, StopChild
 from .structure import AddChild, RemoveActor, Reorder, SetFlags, named_spec
@@ -165,7 +165,7 @@ class Change:
     @property
     def steps(self) -> tuple[Step, ...]:
         """Return the steps of the transaction, in the order in which they are taken."""
-        return tuple(Step(n, one.verb, one.target, one.text) for n, one in enumerate(self._operations, 1))
+        return tuple(Step(n, one.verb, one.target, one.text, one.note) for n, one in enumerate(self._operations, 1))
 
     async def settled(self) -> tuple[MechanismSettled, ...]:
         """Wait until it is known whether the mechanisms that this transaction has changed stay.
@@ -192,5 +192,4 @@ class Change:
 
     def describe(self) -> str:
         """Say in words which steps there are, and how the tree changes (known after the checks)."""
-        lines = [f"{step.number}. {step.text}" for step in self.steps] or ["nothing to do"]
-        return "\n".join([*lines, *(self._difference or ())])
+        return "\n".join([*described_steps(self.steps), *(self._difference or ())])

@@ -1,12 +1,15 @@
-"""Operations on where an actor lives, and on its mechanisms: one stack in the place of another, update a brick."""
+"""Operations on where an actor lives, and on its mechanisms; and to whom it may give orders there."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from ...actors.errors import SpecError
 from ...actors.kernel.ref import Target
+from ...actors.process.grants import said_of_grants, why_not_granted
+from ...actors.process.wire.worker_gate import is_at_or_below
 from ...supervision.arbiter import Hand, arbiter_of
 from ...supervision.respec import NO_RECIPE, recipe_spec
 from ...supervision.spec import Isolation
@@ -14,9 +17,9 @@ from ...supervision.supervisor_changes import check_subtree
 from .draft import Draft, DraftPlace, is_elsewhere, rules
 from .handing import is_far
 from .living import OnSharedWork
-from .operation import wrong
+from .operation import Operation, wrong
 from .relocation import Relocation, described
-from .reparenting import Regrouping, successors
+from .reparenting import Regrouping, Reparent, successors
 from .succession import Beside
 
 if TYPE_CHECKING:
@@ -202,3 +205,46 @@ def mechanism_text(mechanism: Any) -> str:
         layer if isinstance(layer, str) else layer.__name__ if isinstance(layer, type) else type(layer).__name__
         for layer in layers
     )
+
+
+def look_at_grants(steps: Iterable[Operation]) -> None:
+    """Have each step that takes an actor into a process say to whom that one may give orders there.
+
+    Raises:
+        SpecError: it has given orders to others so far.
+    """
+    for step in steps:
+        place = step._found if isinstance(step, (OnPlace, Reparent)) else None
+        if place is None or place.cell is None or place.is_leaving or not place.cell.host.place.is_here:
+            continue
+        home = _process_of(place)
+        if home is None:
+            continue
+        granted = list(_granted(home))
+        step.note = said_of_grants(place.path, home.path, granted)
+        cells = [one.cell for one in place.walk() if one.cell is not None]
+        if why := why_not_granted(cells, home.path, granted):
+            raise wrong(place.path, why)
+
+
+def _process_of(place: DraftPlace) -> DraftPlace | None:
+    """Whose process a place will be in; None: that of the root."""
+    for one in place.upwards():
+        if one.spec is not None:
+            if one.spec.isolation == "process" or one.spec.mechanism is not None:
+                return one
+        elif one.cell is not None and not one.cell.host.place.is_here:
+            return one
+    return None
+
+
+def _granted(home: DraftPlace) -> Iterator[str]:
+    """To whom the bindings of those in a process lead, and what its recipe grants."""
+    seen = {home.path}
+    for place in home.walk():
+        start = None if place.spec is None else place.spec.start
+        recipe = () if start is None else start.kind._may_order(start, place.path)
+        for to in (*(one.path for one in place.bindings.values()), *recipe):
+            if not any(is_at_or_below(to, one) for one in seen):
+                seen.add(to)
+                yield to

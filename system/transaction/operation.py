@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, ClassVar
 
 from ...actors.errors import SpecError
@@ -25,6 +26,8 @@ class Step:
     """The address that it is about, as it is at that point."""
     text: str
     """The step in words."""
+    note: str = ""
+    """What follows from it besides, in a sentence: to whom an actor may give orders in the process it comes to."""
 
 
 class StagedWork:
@@ -83,6 +86,8 @@ class Operation(StagedWork):
         self.between_turns_of: tuple[DraftPlace, ...] = ()
         """Whose turns have to be over for this; known after the check."""
 
+    note: str = ""
+    """What follows from it besides, in a sentence; known after the checks."""
     _found: DraftPlace | None = None
 
     @property
@@ -103,6 +108,15 @@ class Operation(StagedWork):
             HoldfastError: why not.
         """
         raise NotImplementedError
+
+
+def described_steps(steps: Iterable[Step]) -> list[str]:
+    """Steps as lines of text, each with what follows from it besides."""
+    lines: list[str] = []
+    for step in steps:
+        lines.append(f"{step.number}. {step.text}")
+        lines += [f"   {step.note}"] if step.note else []
+    return lines or ["nothing to do"]
 
 
 def text_of(target: Target) -> str:

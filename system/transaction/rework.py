@@ -25,6 +25,7 @@ from ...supervision.respec import respec
 from ..live_moves import ended_too_often
 from .arrangement import busy
 from .operation import PROTECTED, StagedWork, wrong
+from .relocation import seen
 
 if TYPE_CHECKING:
     from ..system import ActorSystem
@@ -209,7 +210,11 @@ class Rework(StagedWork):
         cell = self._place.now(system._node)
         try:
             if cell is not None and self._lock is not None:
-                await order(cell, Conclude(self._attempt, False, None), CONCLUDED_WITHIN)
+                concluded = order(cell, Conclude(self._attempt, False, None), CONCLUDED_WITHIN)
+                if self._held is None:  # It has not come to it so far, and obeys this behind it.
+                    concluded.add_done_callback(seen)
+                else:
+                    await concluded
         except (AskFailed, ActorStopped):
             pass  # The life that was held has ended.
         finally:

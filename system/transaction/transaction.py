@@ -17,6 +17,7 @@ from .change import Change
 from .draft import Draft, difference
 from .errors import TransactionFailed, TransactionRefused
 from .events import TransactionBegan, TransactionCommitted, TransactionRolledBack
+from .mechanisms import look_at_grants
 from .operation import Operation
 
 if TYPE_CHECKING:
@@ -115,6 +116,7 @@ class Transaction:
         try:
             draft.check()
             system._specifications.check(draft.root)
+            look_at_grants(change.operations)
         except HoldfastError as error:
             raise TransactionRefused("the tree as it would be", said(error)) from error
         change._difference = difference(before, draft.lines())
@@ -157,6 +159,7 @@ class Transaction:
         except BaseException as error:
             if isinstance(error, TimeoutError):
                 waits = "; ".join(filter(None, (waiting, "" if at is None else at.waits_for)))
+                waits = waits or ("" if at is None else await system._turn_in_hand(at.target))
                 cause = f"not within {self._timeout:g} s{f': {waits}' if waits else ''}"
             else:
                 cause = said(error)

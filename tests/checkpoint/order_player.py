@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 import json
 import os
 import signal
@@ -16,6 +17,7 @@ from typing import Any
 import holdfast as hf
 
 TOPIC = "/said"
+GATE = "/app/gate"
 IN_TIME = 60.0
 SUPERVISORS = {"north": ("r0", "r1"), "south": ("r2",)}
 RECEIVERS = {f"{name}": f"/app/{above}/{name}" for above, names in SUPERVISORS.items() for name in names}
@@ -24,6 +26,14 @@ RECEIVERS = {f"{name}": f"/app/{above}/{name}" for above, names in SUPERVISORS.i
 class Said(hf.Message[int]):
     sender: str
     n: int
+
+
+class Pass(hf.Message[int]):
+    """As `Said`, by way of the gate."""
+
+    sender: str
+    n: int
+    to: str
 
 
 class Say(hf.Message[int]):
@@ -52,9 +62,22 @@ class Receiver(hf.Actor):
         self.got.setdefault(message.sender, []).append(message.n)
         return message.n
 
+    @hf.on(Pass)
+    def passed(self, message: Pass) -> int:
+        self.got.setdefault(message.sender, []).append(message.n)
+        return message.n
+
     @hf.on(Got, readonly=True)
     def read(self, message: Got) -> dict[str, list[int]]:
         return self.got
+
+
+class Gate(hf.Actor):
+    """Hands on what comes."""
+
+    @hf.on(Pass)
+    def hand_on(self, message: Pass) -> None:
+        self.ctx.forward(self.ctx.find(RECEIVERS[message.to], Receiver))
 
 
 class Sender(hf.Actor):
@@ -81,6 +104,9 @@ class Sender(hf.Actor):
             if message.verb == "timer":
                 self.ctx.tell_after(0.0, Tick(message.to))
                 continue
+            if message.verb.startswith("pass"):
+                await self._pass(message)
+                continue
             said = self._next(message.to, must_come=message.verb in ("tell", "send"))
             match message.verb:
                 case "tell":
@@ -96,6 +122,16 @@ class Sender(hf.Actor):
                     except hf.HoldfastError:
                         pass
         return self.n
+
+    async def _pass(self, message: Say) -> None:
+        """Say it to the gate; what is passed has an order of its own."""
+        said = self._next(f"{message.to} by the gate", must_come=message.verb == "pass on")
+        passed, gate = Pass(f"{self.name} by the gate", said.n, message.to), self.ctx.find(GATE, Gate)
+        if message.verb == "pass on":
+            gate.tell(passed)
+            return
+        with contextlib.suppress(hf.HoldfastError):
+            await gate.ask(passed, timeout=0.2)
 
     @hf.on(Tick)
     def tick(self, message: Tick) -> None:
@@ -125,7 +161,8 @@ def sender(name: str, kind: str, n: int = 0) -> hf.ChildSpec:
         "lfr": {"mechanism": hf.ftm.LFR()},
     }
     own = kinds.get(kind, {})
-    return hf.child(name, hf.start(Sender, name, n), recovery=hf.hybrid(interval=0.1), **own)
+    start = hf.start(Gate) if name == "gate" else hf.start(Sender, name, n)
+    return hf.child(name, start, recovery=hf.hybrid(interval=0.1), **own)
 
 
 def supervisor(name: str, kind: str) -> hf.ChildSpec:
@@ -194,24 +231,30 @@ class Program:
 
     async def tell_all(self, senders: list[str]) -> None:
         """Say one thing more to each receiver, and print what has been said and has come when that is there."""
-        sent = dict[str, Any]()
+        sent, last = dict[str, dict[str, list[int]]](), dict[tuple[str, str], int]()
+        verbs = ["tell"]
+        with contextlib.suppress(hf.errors.NoSuchActor):
+            self.system.ref(GATE, Gate)
+            verbs.append("pass on")
         for name in senders:
             ref = self.system.ref(f"/app/{name}", Sender)
             await ref.ask(Say("", "no stream", 0), timeout=IN_TIME)
             async with asyncio.timeout(IN_TIME):
                 await asyncio.sleep(0.2)  # Timers that are due have come by then.
-            last = {to: await ref.ask(Say(to, "tell", 1), timeout=IN_TIME) for to in RECEIVERS}
-            sent[name] = await ref.ask(Sent(), timeout=IN_TIME), last
-        got = dict[str, Any]()
+            for to, verb in itertools.product(RECEIVERS, verbs):
+                who = name if verb == "tell" else f"{name} by the gate"
+                last[who, to] = await ref.ask(Say(to, verb, 1), timeout=IN_TIME)
+            sent[name] = await ref.ask(Sent(), timeout=IN_TIME)
+        got = dict[str, dict[str, list[int]]]()
         for to in RECEIVERS:
             receiver = self.at(to)
             async with asyncio.timeout(IN_TIME):
                 while True:
                     got[to] = await receiver.ask(Got(), timeout=IN_TIME)
-                    if all(last[to] in got[to].get(name, ()) for name, (_, last) in sent.items()):
+                    if all(n in got[to].get(who, ()) for (who, at), n in last.items() if at == to):
                         break
                     await asyncio.sleep(0.01)
-        sys.stdout.write(json.dumps([{name: one for name, (one, _) in sent.items()}, got]))
+        sys.stdout.write(json.dumps([sent, got]))
 
 
 async def main(store: str, steps: list[list[Any]]) -> None:

@@ -23,8 +23,74 @@ SMALL_DISK = "tests/checkpoint/sqlite/test_small_disk.py"
 CLOCKS_SET = "tests/effects/test_clocks_set.py"
 BETWEEN = "tests/checkpoint/test_between_lives.py"
 ORDER = "tests/checkpoint/test_order.py"
+REGISTRY = "tests/supervision/test_registry_recorded.py"
+ORDERS = "tests/checkpoint/test_restart_orders.py"
+GIVEN_UP = "tests/checkpoint/test_given_up.py"
 
 CHECKS = {
+    "a recorded holder is found when it lives again": Check(
+        "checkpoint/home/switch.py",
+        "for come in self.node.awaited.pop(self.path, ()):",
+        "for come in ():",
+        REGISTRY,
+        "ended_by_itself and hybrid",
+    ),
+    "who is erased holds nothing": Check(
+        "checkpoint/home/homes.py",
+        "        self._entries.erase(path)\n",
+        "",
+        REGISTRY,
+        "begins_with_nothing",
+    ),
+    "what an actor holds moves with it": Check(
+        "checkpoint/home/homes.py",
+        "        self._entries.rename(names)\n",
+        "",
+        REGISTRY,
+        "moves_with_it",
+    ),
+    "a recorded holder that has ended is not found": Check(
+        "supervision/services/registrar.py",
+        "return not holder.has_nobody",
+        "return not holder.is_dead",
+        REGISTRY,
+        "ended_by_itself and hybrid",
+    ),
+    "what bears repetition is asked again by the next program": Check(
+        "checkpoint/home/pending_asks.py",
+        "if turn > home.ledger.turn and home.homes.bears_repetition(home.node.codec, out.name, out.body):",
+        "if False:",
+        ORDERS,
+        "end and task",
+    ),
+    "a child that would be there twice is not asked for again": Check(
+        "supervision/repeatable.py",
+        "return not start.fresh and start.id is not None",
+        "return True",
+        ORDERS,
+        "without and task",
+    ),
+    "what was put aside is not handled when its asker has given up": Check(
+        "checkpoint/life/recorded_context.py",
+        "feed.is_ask, feed.chain, deadline=feed.deadline,",
+        "feed.is_ask, feed.chain,",
+        GIVEN_UP,
+        "not_served and hybrid-task-stashed",
+    ),
+    "a turn waits for no message whose asker has given up": Check(
+        "checkpoint/long_waits.py",
+        "return is_wanted and not (source.begins_by and self._home.node.clock.is_past(source.begins_by))",
+        "return is_wanted",
+        GIVEN_UP,
+        "not_served and hybrid-task-waited",
+    ),
+    "what was put aside and has begun is finished": Check(
+        "checkpoint/life/recorded_life.py",
+        "            first.feed.has_begun = True\n",
+        "",
+        GIVEN_UP,
+        "finished_in_the_next_life and hybrid-task",
+    ),
     "what an earlier program has kept comes first": Check(
         "checkpoint/home/ask_recovery.py",
         "sorted(messages, key=lambda one: not one[1].is_earlier):",
@@ -44,21 +110,28 @@ CHECKS = {
         "(out.to, *led, *home.homes.addresses.known_as(out.to))",
         "(out.to, *led)",
         ORDER,
-        "each_address and tell-after-receiver",
+        "each_address and tell-receiver-after",
+    ),
+    "an ask is handed on in the append that ends the turn": Check(
+        "checkpoint/home/outputs.py",
+        "if switch is not None and not switch.waits(ask) and switch.takes_now(ask, out, sender):",
+        "if False:",
+        "tests/checkpoint/test_forwarded.py",
+        "handed_on_is_not_lost and ask-unbounded",
     ),
     "who is started anew tells other things than before": Check(
         "checkpoint/home/ask_recovery.py",
         'return f"kept {home.path}|{turn}.{out.k} {home.node.numbers.next_seed():x}"',
         'return f"kept {home.path}|{turn}.{out.k}"',
         ORDER,
-        "started_anew and tell-task",
+        "started_anew and task-tell",
     ),
     "who is started anew asks other things than before": Check(
         "checkpoint/home/ask_recovery.py",
         'return f"{MARK}{turn}.{out.k}.{since(source)} {home.path}"',
         'return f"{MARK}{turn}.{out.k}.0 {home.path}"',
         ORDER,
-        "started_anew and ask-task",
+        "started_anew and task-ask",
     ),
     "a turn has one outcome of an ask, whoever else writes another": Check(
         "checkpoint/home/input_ledger.py",
@@ -440,8 +513,8 @@ CHECKS = {
     ),
     "who has said that it ends does so in the next program": Check(
         "checkpoint/home/switch.py",
-        "begun, own.wanted, own.past))\n",
-        "begun, None, own.past))\n",
+        "begun, own.wanted, own.past, spent))\n",
+        "begun, None, own.past, spent))\n",
         "tests/checkpoint/test_restart_ends.py",
         "test_it_says_good_bye",
     ),

@@ -59,6 +59,7 @@ async def reconfigure(system):
         change.respecify("/app/left/a", restart="transient", backoff=hf.Backoff(initial=0.5), register="first")
 """
 
+OF_A_REF = "async def reconfigure(system):\n await system.ref('/app/left/a').{call}"
 NO_STEP = """
 async def reconfigure(system):
     async with system.transaction() as change:
@@ -255,6 +256,12 @@ async def test_the_same_script_runs_in_process(system: hf.ActorSystem, grow: Pat
             "changed my mind",
         ),
         (NO_STEP, FAILED, "script.py:4: a transaction has no 'respecifi' in a script; did you mean respecify?"),
+        (
+            OF_A_REF.format(call="ask(None)"),
+            FAILED,
+            "script.py:2: a script sends no messages, so that its refs have no 'ask'",
+        ),
+        (OF_A_REF.format(call="kill()"), FAILED, "an actor has no 'kill' in a script. There is path, and nothing else"),
         (OF_ITS_OWN, FAILED, "AttributeError: 'str' object has no attribute 'respecify'"),
     ],
 )

@@ -1,6 +1,7 @@
 """A system as a part of a program that others start, watch and end: verdicts, probes, workers, the end of a server."""
 
 import asyncio
+import os
 import signal
 import socket
 import tempfile
@@ -111,6 +112,22 @@ async def test_a_child_that_is_away_makes_it_not_ready() -> None:
                 await asyncio.sleep(0)
         assert verdict.text == "1 of 1 children of the root do not run"
         assert (await service.live()).is_good  # It will come back: another program would not help.
+
+
+async def test_a_child_whose_process_is_silent_makes_it_not_ready() -> None:
+    async with Service(system()) as service:
+        kept = await service.system.start(hf.child("kept", hf.start(Counter), isolation="process"))
+        service.up()
+        assert (await service.ready()).text == "ok"
+        pid = service.system.pid_of(kept)
+        os.kill(pid, signal.SIGSTOP)
+        try:
+            assert (await service.ready()).text == "the process of /app/kept does not answer"
+            assert (await service.live()).is_good
+        finally:
+            os.kill(pid, signal.SIGCONT)
+        assert await kept.ask(Add(1)) == 1
+        assert (await service.ready()).text == "ok"
 
 
 class FullStore(SqliteJournal):

@@ -44,6 +44,27 @@ CHECKS = {
         HEALTH,
         "test_if_the_tree_fails_the_server_ends",
     ),
+    "a service is not ready while children wait for whom they are bound to": Check(
+        "supervision/dynamic.py",
+        "            tell_wait(self.ctx._cell)\n",
+        "            pass\n",
+        "tests/supervision/test_expected.py",
+        "not_ready_while_they_wait",
+    ),
+    "what is not known to be over is looked at again": Check(
+        "console/service/health.py",
+        "    waiting.update(cell for cell, found in zip(asked, told, strict=True) if found)\n",
+        "",
+        "tests/supervision/test_expected.py",
+        "not_ready_while_they_wait",
+    ),
+    "a service is not ready while a child of the root is silent": Check(
+        "console/service/health.py",
+        '        return [*problems, *(f"the process of {path} does not answer" for path in silent), *waits]\n',
+        "        return [*problems, *waits]\n",
+        HEALTH,
+        "is_silent",
+    ),
     "a worker waits for a store that is becoming free": Check(
         "console/service/health.py",
         "if number == self._workers - 1 and time.monotonic() > until:",

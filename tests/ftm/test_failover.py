@@ -116,6 +116,25 @@ async def test_a_first_start_loses_no_protection(system: hf.ActorSystem, mechani
         assert not [one for one in events.take() if isinstance(one, ProtectionLost)]
 
 
+@pytest.mark.parametrize("mechanism", [PBR(), LFR(), TMR()], ids=["pbr", "lfr", "tmr"])
+async def test_a_start_that_replays_loses_no_protection(tmp_path: Path, mechanism: Any) -> None:
+    """What is replayed comes out again before another replica has joined; that is no loss, a death behind it is."""
+    spec = hf.child("alice", hf.start(Counter), recovery=hf.replay_only(), mechanism=mechanism)
+    store = f"sqlite:{tmp_path / 'app.db'}"
+    async with hf.ActorSystem("app", store=store, log=False) as system:
+        ref = await system.start(spec)
+        assert [await ref.ask(Add(tag)) for tag in range(9)][-1] == 9
+    async with hf.ActorSystem("app", store=store, log=False) as system:
+        with system.events() as events:
+            ref = await system.start(spec)
+            await two_again(ref)
+            assert not [one for one in events.take() if isinstance(one, ProtectionLost)]
+            for name in group_of(ref).membership.names[1:]:
+                os.kill(pid_of(system, ref, name), signal.SIGKILL)
+            assert [await ref.ask(Add(tag)) for tag in (9, 10)] == [10, 11]
+            await events.until(ProtectionLost)
+
+
 async def test_the_graph_of_the_mechanism_is_seen_in_the_tree(system: hf.ActorSystem) -> None:
     """A41, A89."""
     ref = await started(system)

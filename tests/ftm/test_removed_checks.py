@@ -187,10 +187,24 @@ CHECKS = {
     ),
     "who is alone again says so again": Check(
         "ftm/bricks/standing.py",
-        '        self.state, self.missed_by = "live", ""\n',
+        '        self.state, self.is_missed = "live", True\n',
         '        self.state = "live"\n',
         PBR,
         "test_who_is_alone_again",
+    ),
+    "a group has its second replica back within a second": Check(
+        "ftm/group/group_place.py",
+        "Backoff(initial=0.01, maximum=0.8, reset_after=1.0)",
+        "Backoff(initial=0.01, maximum=2.0, reset_after=5.0)",
+        "tests/ftm/test_many_losses.py",
+        "test_a_replica_that_is_lost_at_a_steady_rate",
+    ),
+    "who was never protected has not lost it": Check(
+        "ftm/bricks/standing.py",
+        "        self.is_missed = False  # there",
+        "        self.is_missed = True  # there",
+        FAILOVER,
+        "test_a_start_that_replays_loses_no_protection",
     ),
     "what was replayed is decided before `on_recovered` is called": Check(
         "ftm/bricks/bricks.py",

@@ -14,7 +14,8 @@ from holdfast.actors.events import ActorCrashed, ActorStarted, ChildStopped, Dea
 from holdfast.actors.exit_reasons import SHUTDOWN, Crash, crash
 from holdfast.actors.kernel.codec import Parcel
 from holdfast.checkpoint.store_opening import open_journal
-from holdfast.system.history import quota, recorder, tracks, writer
+from holdfast.system.history import recorder, tracks, writer
+from holdfast.system.history.intake import alike, quota
 from holdfast.system.history.lives import LivesByAddress
 from holdfast.system.history.past_event import LONGEST, PastEvent, plain_fields
 from holdfast.system.history.raised import raised_at, traceback_text
@@ -273,13 +274,103 @@ async def test_dead_letters_leave_the_others_alone() -> None:
         worker = await system.start(hf.child("worker", hf.start(Worker)))
         await failed(worker, "crash")
         await system.stop(worker)
-        for _ in range(3_000):
+        for _ in range(9_000):
             worker.tell(Do("well"))
-        assert system.dead_letters == 3_000
-        letters = system.history(kinds=["DeadLetter"]).events
-        assert tracks.BOUNDS["letters"].burst <= len(letters) < 600
+        assert system.dead_letters == 9_000
+        assert len(system.history(kinds=["DeadLetter"]).events) == alike.FIRST
         assert not system._node.events.hears_letters
         assert [one.kind for one in system.history(worker.path).events][:2] == ["ActorStarted", "ActorCrashed"]
+
+
+# -- events that are alike --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("recovery", [None, hf.hybrid()])
+@pytest.mark.parametrize("overflow", ["drop_oldest", "drop_newest", "latest"])
+async def test_what_a_mailbox_drops_by_its_policy_is_counted(tmp_path: Path, overflow: Any, recovery: Any) -> None:
+    store = f"sqlite:{tmp_path / 'app.db'}"
+    async with hf.ActorSystem("app", store=store, log=False) as system:
+        one = hf.child("worker", hf.start(Worker), mailbox=hf.bounded(1, overflow=overflow), recovery=recovery)
+        worker = await system.start(one)
+        await system.suspend(worker)
+        for _ in range(201):
+            worker.tell(Do("well"))
+        dropped, why = system.dead_letters, f"mailbox full (1, {overflow})"
+        assert dropped >= 199
+        [letter] = system.history(kinds=["DeadLetter"]).events
+        assert letter.fields["why"] == why
+    async with hf.ActorSystem("app", store=store, log=False) as system:
+        letters = [one for one in system.history(kinds=["DeadLetter"]).events if one.fields["why"] == why]
+        assert [letter.fields.get("alike") for letter in letters] == [None, dropped - 1]
+        assert {letter.fields["message"] for letter in letters} == {"tests.history.players.Do"}
+
+
+async def test_dead_letters_that_nobody_has_chosen_are_told_one_by_one_and_then_counted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(recorder, "EVERY", 0.05)
+    async with hf.ActorSystem("app", log=False) as system:
+        for name in ("one", "two"):
+            worker = await system.start(hf.child(name, hf.start(Worker)))
+            await system.stop(worker)
+            for _ in range(alike.FIRST + 7):
+                worker.tell(Do("well"))
+
+        def counted() -> list[Any]:
+            rows = [one for one in system.history(kinds=["DeadLetter"]).events if "alike" in one.fields]
+            return [(row.address, row.fields["alike"], row.fields["why"]) for row in rows]
+
+        assert len(system.history(kinds=["DeadLetter"]).events) == 2 * alike.FIRST
+        await until(lambda: len(counted()) == 2)
+        assert counted() == [(f"/app/{name}", 7, "the actor has stopped") for name in ("one", "two")]
+
+
+@pytest.mark.parametrize(
+    "told",
+    [
+        hf.events.TurnSlow("/app/one", "tests:Do", 0.3),
+        hf.events.Masked("/app/one", "/app/one/ftm/r1", "7"),
+        hf.events.FrameRefused("/app/one", "/app/one/ftm/r1", "forged", 1),
+        hf.events.LoopLagged("/app", 0.3),
+        hf.events.DeadLetter("/app/one", Large("x"), "refused: no"),
+    ],
+    ids=lambda told: type(told).__name__,
+)
+async def test_one_rule_holds_for_all_that_may_come_as_often_as_messages(told: hf.events.Event) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        for _ in range(400):
+            system._node.emit(told)
+        assert len(system.history(told.address, kinds=[type(told).__name__]).events) == alike.FIRST
+        assert not system.history(kinds=["EventsLeftOut"]).events
+
+
+async def test_sorts_that_are_told_apart_are_bounded_and_what_was_counted_of_them_is_told() -> None:
+    counter = alike.AlikeCounter()
+    for number in range(alike.MOST_SORTS + 1):
+        letter = DeadLetter(f"/app/{number}", Large("x"), "mailbox full (1, latest)")
+        assert [counter.counts(letter, 0.0) for _ in range(3)] == [False, True, True]
+    rows = counter.take_rows()
+    assert len(rows) == alike.MOST_SORTS + 1
+    assert {(kind, fields["alike"]) for kind, _, fields in rows} == {("DeadLetter", 2)}
+    assert counter.take_rows() == []
+    counter.counts(letter, 0.0)
+    counter.forget(letter.address)
+    assert counter.take_rows() == []
+
+
+async def test_many_events_that_go_on_are_written_more_seldom(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(writer, "PACE", 0.01)
+    monkeypatch.setattr(writer, "LONGEST_PACE", 60.0)
+    monkeypatch.setattr(writer, "BURST_BYTES", 64 * 1024)
+    async with hf.ActorSystem("app", log=False, history=False) as system:
+        store = Refusing()
+        kept = recorder.HistoryRecorder(system._node, store, log_payloads=False)
+        for number in range(100):
+            system._node.emit(hf.events.HookFailed(f"/app/{number}", "on_stop", SHUTDOWN))
+            await asyncio.sleep(0.02)
+        assert 2 < store.tries < 20
+        kept.close()
+        assert len(writer.stored(store)) == 102
 
 
 def test_the_start_of_a_crowd_leaves_room_for_what_follows() -> None:

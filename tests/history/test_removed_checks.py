@@ -44,6 +44,27 @@ CHECKS = {
         BOUNDS,
         "test_a_storm_is_recorded_in_part_and_no_more_events_are_made",
     ),
+    "what a mailbox drops by its policy is counted": Check(
+        "system/history/intake/alike.py",
+        "EventQuota(1 if is_meant else FIRST, 1.0 / EVERY, now)",
+        "EventQuota(FIRST, 1.0 / EVERY, now)",
+        BOUNDS,
+        "test_what_a_mailbox_drops_by_its_policy_is_counted",
+    ),
+    "events that are alike are counted after the first": Check(
+        "system/history/recorder.py",
+        "if kind in UNKEPT or self._is_counted(event) or not self._admits(event, kind):",
+        "if kind in UNKEPT or not self._admits(event, kind):",
+        BOUNDS,
+        "test_one_rule_holds_for_all_that_may_come_as_often_as_messages",
+    ),
+    "many events that go on are written more seldom": Check(
+        "system/history/writer.py",
+        "            self._due = now + self._spent.add(written, now)\n",
+        "            self._due = now + PACE\n",
+        BOUNDS,
+        "test_many_events_that_go_on_are_written_more_seldom",
+    ),
     "what is rare has a quota of its own": Check(
         "system/history/tracks.py",
         '    if kind in RARE:\n        return "rare"\n',
@@ -144,7 +165,7 @@ CHECKS = {
     ),
     "texts have a bounded size": Check(
         "system/history/past_event.py",
-        'shortened(_dotted(value) if name == "message" else value)',
+        'shortened(dotted(value) if name == "message" else value)',
         "value",
         BOUNDS,
         "test_a_text_of_any_size_is_kept_in_a_bounded_one",

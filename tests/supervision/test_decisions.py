@@ -12,6 +12,7 @@ ABNORMAL: list[hf.ExitReason] = [
     hf.NOPROC,
     hf.Crash("ValueError", "no"),
     hf.Signal(9),
+    hf.ForkServerDied(1, "SIGKILL"),
     hf.Exited(0),
     hf.OutOfMemory(),
     hf.Hung(3.0),

@@ -1,7 +1,9 @@
 """The tables of docs/differs-from-otp.md: every entry has a reason and a test, and every test an entry."""
 
 import asyncio
+import os
 import re
+import signal
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
@@ -10,7 +12,7 @@ import pytest
 
 import holdfast as hf
 from holdfast.testing import probe
-from tests.supervision.family import Boom, Family, Life, Plan, kid, refused
+from tests.supervision.family import Boom, Family, Leave, Life, Plan, kid, refused
 
 TEXT = (Path(__file__).parents[2] / "docs" / "differs-from-otp.md").read_text("utf-8")
 SLOW = hf.Backoff(initial=60.0, maximum=60.0, jitter=0.0)
@@ -154,6 +156,18 @@ async def slow_restarts_add_up(system: hf.ActorSystem) -> None:
     for _ in range(2):
         await family.after("a", Boom())
         await asyncio.sleep(1.0)  # It is up again by now.
+    assert not family.is_alive
+
+
+@entry("children that end by one common cause")
+async def one_cause_is_one_restart(system: hf.ActorSystem) -> None:
+    plan, cause = Plan(), hf.ForkServerDied(1, "SIGKILL")
+    family = await Family.start(system, plan, *(kid(plan, name) for name in "abc"), intensity=1, restart="temporary")
+    for name in "abc":
+        family.ref(name).tell(Leave(cause))
+    await family.rest()
+    assert (await family.states()) == {"a": "running", "b": "running", "c": "running"}
+    await family.after("a", Leave(cause))  # It would not end by the same cause for ever.
     assert not family.is_alive
 
 
@@ -429,7 +443,123 @@ async def a_mailbox_is_handled_in_order(system: hf.ActorSystem) -> None:
     assert await ref.ask(Told()) == ["first", "urgent"]
 
 
-REAL = ["specs_from_processes_stay_packed"]
+class Teller(hf.Actor):
+    """Tells the scribe, changes itself, and then comes to an end in the middle of its turn."""
+
+    scribe: hf.Binding[Scribe]
+
+    def __init__(self, seen: list[str]) -> None:
+        self.seen, self.half = seen, False
+
+    @hf.on(Word)
+    def word(self, message: Word) -> None:
+        self.half = True
+        self.scribe.tell(Word(message.text))
+        if message.text == "kill":
+            os.kill(os.getpid(), signal.SIGKILL)
+        raise ValueError(message.text)
+
+    @hf.on(Told)
+    def look(self, message: Told) -> list[str]:
+        return ["half"] if self.half else []
+
+    def on_stop(self, reason: hf.ExitReason) -> None:
+        self.seen.append("half" if self.half else "whole")
+
+
+async def teller(
+    system: hf.ActorSystem, *, seen: list[str] | None = None, **options: Any
+) -> tuple[hf.ActorRef[Scribe], hf.ActorRef[Teller]]:
+    to = await scribe(system)
+    start = hf.start(Teller, [] if seen is None else seen)
+    return to, await system.start(hf.child("teller", start, bindings={"scribe": to.path}, **options))
+
+
+@entry("what a turn has sent when it crashes")
+async def a_recorded_turn_that_crashes_takes_back_what_it_has_told(system: hf.ActorSystem) -> None:
+    to, one = await teller(system, recovery=hf.hybrid())
+    one.tell(Word("crash it"))
+    assert await one.ask(Told()) == []
+    assert await to.ask(Told()) == []
+    await system.terminate(one)
+    plain = await system.start(hf.child("plain", hf.start(Teller, []), bindings={"scribe": to.path}))
+    plain.tell(Word("crash this"))
+    assert await plain.ask(Told()) == []
+    assert await to.ask(Told()) == ["crash this"]
+
+
+@entry("what a turn has sent when its process is killed")
+async def what_a_turn_has_told_leaves_its_process_behind_it(system: hf.ActorSystem) -> None:
+    to, one = await teller(system, isolation="process")
+    one.tell(Word("kill"))
+    assert await one.ask(Told()) == []
+    assert await to.ask(Told()) == []
+
+
+@entry("`terminate` after a crash")
+async def on_stop_sees_the_state_as_the_crash_has_left_it(system: hf.ActorSystem) -> None:
+    seen: list[str] = []
+    _, one = await teller(system, seen=seen)
+    one.tell(Word("crash it"))
+    assert await one.ask(Told()) == []
+    assert seen == ["half"]
+
+
+class Ticking(hf.Actor):
+    def __init__(self) -> None:
+        self.ticks = 0
+
+    def on_start(self, restored: bool) -> None:
+        self.ctx.every(1.0, Open())
+
+    @hf.on(Open)
+    def tick(self, message: Open) -> None:
+        self.ticks += 1
+
+    @hf.on(Hold)
+    async def hold(self, message: Hold) -> None:
+        await asyncio.sleep(10.5)
+
+    @hf.on(Told)
+    def look(self, message: Told) -> list[str]:
+        return ["tick"] * self.ticks
+
+
+@entry("`timer:send_interval` of a process that is busy")
+async def ticks_are_left_out_while_one_waits(system: hf.ActorSystem) -> None:
+    ref = await system.start(hf.child("ticking", hf.start(Ticking)))
+    await ref.ask(Hold(), timeout=60.0)
+    assert await ref.ask(Told()) == ["tick"]
+
+
+class Link(hf.Message): ...
+
+
+class Linked(Scribe):
+    def on_start(self, restored: bool) -> None:
+        self.ctx.trap_exits = True
+
+    @hf.on(Link)
+    def link(self, message: Link) -> None:
+        self.ctx.link(self.ctx.find(f"{self.ctx.path.rpartition('/')[0]}/other", Scribe))
+
+    def on_exit(self, source: hf.ActorRef[hf.Actor], reason: hf.ExitReason) -> None:
+        self.told.append(str(reason))
+
+
+@entry("a link with an actor that recovers")
+async def a_link_hears_nothing_of_a_crash_that_is_recovered_from(system: hf.ActorSystem) -> None:
+    ref = await scribe(system, kind=Linked)
+    other = await system.start(hf.child("other", hf.start(Scribe), recovery=hf.hybrid()))
+    await ref.ask(Link())
+    other.tell(Word("crash"))
+    await other.ask(Told())
+    assert await ref.ask(Told()) == []
+    await system.stop(other)
+    assert await ref.ask(Told()) == ["shutdown"]
+
+
+REAL = ["specs_from_processes_stay_packed", "what_a_turn_has_told_leaves_its_process_behind_it"]
 """Those that start a process, and so cannot live in virtual time."""
 
 

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from holdfast.supervision.intensity import admit_restart
+from holdfast.supervision.intensity import CountedCauses, admit_restart
 
 
 def admitted(times: list[float], *, intensity: int, period: float) -> list[bool]:
@@ -57,3 +57,18 @@ def test_no_period_ever_holds_more_than_the_intensity(gaps: list[float], intensi
         assert more == (*recent, now)
         window = more
         history.append(now)
+
+
+def test_a_common_cause_counts_once_for_each_child() -> None:
+    """So that one which ends by it again and again is given up at last."""
+    causes = CountedCauses()
+    struck = [("a", "x"), ("a", "y"), ("b", "x"), ("a", "y"), ("a", "x"), ("", "x"), ("", "y")]
+    shared = [causes.is_counted(cause, child, 0.0, 5.0) for cause, child in struck]
+    assert shared == [False, True, False, False, True, False, False]
+
+
+@pytest.mark.parametrize(("now", "is_shared"), [(5.0, True), (5.000001, False)])
+def test_a_common_cause_is_counted_once_within_a_period(now: float, is_shared: bool) -> None:
+    causes = CountedCauses()
+    assert not causes.is_counted("a", "x", 0.0, 5.0)
+    assert causes.is_counted("a", "y", now, 5.0) is is_shared

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
+from holdfast.supervision.services import program_lines
 from holdfast.supervision.services.program_lines import MOST
 from tests.actors.process.waiting import next_event, until
 from tests.supervision.programs import info, python, refused, sh
@@ -58,6 +59,11 @@ async def heard(listener: hf.ActorRef[Listener], count: int) -> list[str]:
 
 async def say(system: hf.ActorSystem, text: str) -> None:
     await system.ref("/app/it", hf.supervision.Program).ask(hf.supervision.ProgramInput(f"{text}\n"), 30)
+
+
+async def printed(events: hf.events.EventStream, text: str) -> None:
+    while (await next_event(events, hf.events.LogLine)).text != text:
+        pass
 
 
 @pytest.mark.parametrize("how", ["ref", "address", "name", "recorded", "process"])
@@ -113,35 +119,86 @@ async def test_its_end_does_not_wait_for_its_lines(system: hf.ActorSystem) -> No
     assert await heard(listener, 500) == [str(n) for n in range(500)]
 
 
-async def test_without_a_receiver_lines_are_dead_letters_and_the_program_goes_on(system: hf.ActorSystem) -> None:
+async def test_the_first_lines_are_kept_until_the_receiver_is_there(system: hf.ActorSystem) -> None:
     with system.events() as events:
         await system.start(python(ECHO, stdin=True, lines_to="/app/listener"))
         for n in range(3 * MOST):
             await say(system, str(n))
-        for n in range(3 * MOST):
-            letter = await next_event(events, hf.events.DeadLetter)
-            assert letter.address == "/app/listener"
-            assert letter.message == hf.supervision.ProgramLine("/app/it", "stdout", f"got {n}")
+        await printed(events, f"got {3 * MOST - 1}")
         listener = await system.start(hf.child("listener", hf.start(Listener)))
         await say(system, "now")
-        assert await heard(listener, 1) == ["got now"]
+        assert await heard(listener, 3 * MOST + 1) == [*(f"got {n}" for n in range(3 * MOST)), "got now"]
         await system.stop(listener)
         await say(system, "gone")
         assert (await next_event(events, hf.events.DeadLetter)).message.text == "got gone"
 
 
+class Bound(Listener):
+    """Starts only when the program that it hears is up."""
+
+    driver: hf.Binding[hf.supervision.Program]
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_a_receiver_that_is_bound_to_the_program_hears_its_first_lines(
+    system: hf.ActorSystem, isolation: Any
+) -> None:
+    hearing = hf.child("sense", hf.start(Bound), bindings={"driver": "/app/robot/lidar"}, isolation=isolation)
+    lidar = sh("echo header; echo first; exec sleep 99", id="lidar", ready="first", lines_to="/app/robot/sense")
+    await system.start(hf.supervisor("robot", children=[lidar, hearing]))
+    sense = system.ref("/app/robot/sense", Bound)
+    assert await heard(sense, 2) == ["header", "first"]
+
+
+async def test_so_they_are_below_a_supervisor_in_a_process(system: hf.ActorSystem) -> None:
+    lidar = sh("for n in 1 2 3 4 5; do echo $n; done; exec sleep 99", lines_to="/app/listener")
+    with system.events() as events:
+        await system.start(hf.supervisor("far", isolation="process", children=[lidar]))
+        await printed(events, "5")
+        listener: hf.ActorRef[Listener] = await system.start(hf.child("listener", hf.start(Listener)))
+        assert await heard(listener, 5) == [*"12345"]
+
+
+async def test_lines_that_wait_for_a_receiver_are_bounded_in_number_and_time(
+    system: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(program_lines, "MOST_KEPT", 3)
+    monkeypatch.setattr(program_lines, "PATIENCE", 0.3)
+    with system.events() as events:
+        await system.start(python(ECHO, stdin=True, lines_to="/app/listener"))
+        for n in range(5):
+            await say(system, str(n))
+        lost = [(await next_event(events, hf.events.DeadLetter)).message.text for _ in range(5)]
+        assert lost == [f"got {n}" for n in range(5)]
+        await say(system, "late")
+        assert (await next_event(events, hf.events.DeadLetter)).message.text == "got late"
+
+
 async def test_a_name_is_looked_up_for_each_line(system: hf.ActorSystem) -> None:
     one, two = [await system.start(hf.child(name, hf.start(Listener))) for name in ("one", "two")]
-    with system.events() as events:
-        await system.start(python(ECHO, stdin=True, lines_to="console"))
-        await say(system, "a")
-        letter = await next_event(events, hf.events.DeadLetter)
-        assert (letter.address, letter.message.text) == ("console", "got a")
+    await system.start(python(ECHO, stdin=True, lines_to="console"))
     for listener, text in ((one, "b"), (two, "c")):
         system.register("console", listener)
         await say(system, text)
         assert await heard(listener, 1) == [f"got {text}"]
         system.unregister("console")
+    with system.events() as events:
+        await say(system, "a")
+        letter = await next_event(events, hf.events.DeadLetter)
+        assert (letter.address, letter.message.text) == ("console", "got a")
+
+
+@pytest.mark.parametrize("logged", [True, False])
+async def test_lines_are_logged_unless_that_is_not_wanted(logged: bool, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO", "holdfast")
+    async with hf.ActorSystem("app") as system:
+        listener = await system.start(hf.child("listener", hf.start(Listener)))
+        await system.start(sh("echo scan; exec sleep 99", lines_to=listener, log_lines=logged))
+        assert await heard(listener, 1) == ["scan"]
+        assert [line.text for line in system.logs("/app/it").lines if line.source == "stdout"] == ["scan"]
+        told = [record for record in caplog.records if "scan" in record.getMessage()]
+        assert len(told) == logged
+        assert not [record for record in told if "is_logged" in record.getMessage()]
 
 
 async def test_a_line_that_crashes_its_receiver_is_not_told_again(system: hf.ActorSystem) -> None:

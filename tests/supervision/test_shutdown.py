@@ -276,3 +276,24 @@ async def test_terminate_child_waits_until_the_child_has_stopped() -> None:
         top = await system.start(hf.supervisor("top", children=[worker(log, 3.0)]))
         await top.ask(TerminateChild("worker"))
         assert (now(), log[-1]) == (3.0, "worker has stopped")
+
+
+@pytest.mark.parametrize("kind", ["one of a list", "dynamic"])
+@pytest.mark.parametrize("who", ["crashed", "beside it"])
+async def test_who_asks_below_a_supervisor_that_gives_up_is_told_why(kind: str, who: str) -> None:
+    log: list[str] = []
+    specs = [worker(log, id="crashed"), worker(log, id="beside it")]
+    async with hf.ActorSystem("app", log=False, intensity=1) as system:
+        if kind == "dynamic":
+            team = await system.start(hf.dynamic("team", intensity=0))
+            for one in specs:
+                await team.ask(StartChild(one))
+        else:
+            team = await system.start(hf.supervisor("team", children=specs, intensity=0))
+        crashed, asked = system.ref("/app/team/crashed", Worker), system.ref(f"/app/team/{who}", Worker)
+        waits = [asked.ask(Work(3.0), timeout=60.0)] if who != "crashed" else []
+        crashed.tell(Boom())
+        waits.append(asked.ask(Work(), timeout=60.0))
+        with pytest.raises(hf.ActorStopped, match=r"its parent has stopped: .*team/crashed: .*boom"):
+            await waits[-1]
+        await asyncio.gather(*waits, return_exceptions=True)

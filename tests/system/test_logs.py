@@ -308,3 +308,56 @@ async def test_log_false_is_silent(records: list[Record]) -> None:
         system.spawn(hf.start(Fragile)).tell(Boom())
         await system._node.settled()
     assert records == []
+
+
+class Kept(hf.Actor):
+    def __init__(self) -> None:
+        self.pings = 0
+
+    @hf.on(Ping)
+    def ping(self, message: Ping) -> str:
+        self.pings += 1
+        return "pong"
+
+
+def kept(count: int) -> list[hf.ChildSpec]:
+    return [hf.child(f"k{n}", hf.start(Kept), recovery=hf.hybrid()) for n in range(count)]
+
+
+async def test_a_subtree_that_recovers_has_one_record_with_the_numbers(records: list[Record]) -> None:
+    async with hf.ActorSystem() as system:
+        inner = hf.supervisor("inner", children=kept(20))
+        await system.start(hf.supervisor("outer", children=[inner, *kept(10)], intensity=0))
+        for above, number in (("/app/outer/inner", 20), ("/app/outer", 10)):
+            for n in range(number):
+                await system.ref(f"{above}/k{n}", Kept).ask(Ping())
+        system.ref("/app/outer", hf.Supervisor).kill()
+        await asyncio.sleep(5.0)  # of the virtual clock
+        (together,) = of(records, "actors recovered")
+    assert (together["address"], together["actors"], together["replayed"]) == (
+        "/app/outer",
+        30,
+        60,
+    )  # the start of each, and its message
+    assert together["slowest"].startswith("/app/outer/")
+    assert together["seconds"] >= 0.0
+    assert not of(records, "actor recovered")
+
+
+async def test_actors_that_recover_one_by_one_have_a_record_each(records: list[Record]) -> None:
+    async with hf.ActorSystem() as system:
+        refs = [await system.start(spec) for spec in kept(2)]
+        for ref in refs:
+            ref.kill()
+            await asyncio.sleep(5.0)  # of the virtual clock
+        assert [record["address"] for record in of(records, "actor recovered")] == ["/app/k0", "/app/k1"]
+
+
+async def test_siblings_that_recover_together_have_one_record_also_at_the_end(records: list[Record]) -> None:
+    async with hf.ActorSystem() as system:
+        refs = [await system.start(spec) for spec in kept(3)]
+        for ref in refs:
+            ref.kill()
+            await ref.ask(Ping())
+    (together,) = of(records, "actors recovered")
+    assert (together["address"], together["actors"], together["log_level"]) == ("/app", 3, "info")

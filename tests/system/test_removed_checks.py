@@ -18,6 +18,7 @@ BOUNDED = "tests/migration/test_bounded_moves.py"
 AWAITED = "tests/supervision/test_awaited.py"
 CERTIFIED = "tests/system/test_moved_certificates.py"
 AT_ODDS = "tests/migration/test_moves_at_odds.py"
+FORK_SERVER = "tests/actors/process/test_fork_server_died.py"
 SUPERVISORS = "tests/migration/test_moved_supervisors.py"
 KINDS = "tests/migration/test_moved_kinds.py"
 JOURNALS = "tests/supervision/test_dynamic_journal.py"
@@ -37,11 +38,109 @@ CHANGED = "tests/supervision/test_changed_children.py"
 
 DYNAMIC = "tests/supervision/test_dynamic.py"
 
+EXPECTED = "tests/supervision/test_expected.py"
 BOUND = "tests/supervision/test_come_back_bound.py"
 GLANCES = "tests/effects/test_glances_at_effects.py"
 TEXTS = "tests/system/test_texts.py"
+GRANTS = "tests/system/test_grants.py"
+HANGING = "tests/control/test_hanging_turn.py"
+ALIKE = "tests/system/test_alike.py"
+STASH = "tests/system/test_stash_everywhere.py"
+UNCODABLE = "tests/system/test_uncodable.py"
+SHUTDOWN = "tests/supervision/test_shutdown.py"
 
 CHECKS = {
+    "who has given orders to others does not go into a process": Check(
+        "system/transaction/transaction.py",
+        "            look_at_grants(change.operations)\n",
+        "",
+        GRANTS,
+        "stays_where_it_is and pbr-task",
+    ),
+    "orders are noted where they are carried out": Check(
+        "actors/kernel/actor.py",
+        "noting(turn) if issubclass(handles.kind, RuntimeOrder) else turn",
+        "turn",
+        GRANTS,
+        "stays_where_it_is and pbr-task",
+    ),
+    "who ends others is noted": Check(
+        "actors/kernel/ref.py",
+        "            note_order(caller._cell, self._cell)\n        self._cell.living.kill",
+        "            pass\n        self._cell.living.kill",
+        GRANTS,
+        "ended_others",
+    ),
+    "a mechanism behind which orders are refused is taken back": Check(
+        "ftm/group/probation.py",
+        "if name == NOT_GRANTED and self._was_free:",
+        "if False:",
+        GRANTS,
+        "taken_back",
+    ),
+    "a trace does not wait for a turn that waits": Check(
+        "actors/kernel/lifecycle.py",
+        "        if call.runs_beside(cell):\n",
+        "        if False:\n",
+        HANGING,
+        "in_the_middle_of_a_turn and task",
+    ),
+    "a change that a turn has kept waiting is given up without waiting for it again": Check(
+        "system/transaction/rework.py",
+        "                if self._held is None:",
+        "                if False:",
+        HANGING,
+        "test_a_transaction_says_it_too and task-suspend",
+    ),
+    "a replay knows which timers have come in turns that are left out": Check(
+        "checkpoint/home/replay.py",
+        "        feed.spent = self.spent_before(number)\n",
+        "",
+        ALIKE,
+        "test_a_handle_says_in_each_life and replayed",
+    ),
+    "a life that has caught up knows it of the last ones": Check(
+        "checkpoint/home/switch.py",
+        "        spent = self.replay.spent_before(math.inf)\n",
+        "        spent = ()\n",
+        ALIKE,
+        "test_a_handle_says_in_each_life and recorded",
+    ),
+    "a replica that takes over knows which timers ran": Check(
+        "ftm/replica/actor_state.py",
+        "    life.timers.take(point.timers)\n",
+        "",
+        ALIKE,
+        "test_a_handle_says_in_each_life and protected",
+    ),
+    "what ends no turn of a message is not put aside": Check(
+        "checkpoint/life/recorded_context.py",
+        " or life.feed is None or fed.message is None:\n",
+        " or life.feed is None:\n",
+        STASH,
+        "test_what_is_no_message_is_not_put_aside and recorded",
+    ),
+    "a timer has no say in what was put aside": Check(
+        "checkpoint/durable_timers.py",
+        "return [source for source in ticks if source.id not in aside]",
+        "return ticks",
+        STASH,
+        "test_a_message_is_put_aside_however and every and recorded",
+    ),
+    "who sends a reply handle is told what to do instead": Check(
+        "actors/kernel/codec.py",
+        "    if isinstance(value, ReplyHandle):\n",
+        "    if False:\n",
+        UNCODABLE,
+        "test_no_message_takes_it_along and replayed",
+    ),
+    "who waits below a supervisor that gives up is told why": Check(
+        "actors/kernel/lifecycle.py",
+        "    cell.extra().reason = end.reason  # Those below it, which end with it, say why.\n",
+        "",
+        SHUTDOWN,
+        "gives_up_is_told_why",
+    ),
     "who comes back waits for whom it is bound to": Check(
         "supervision/dynamic.py",
         "            if one.awaited:\n",
@@ -51,8 +150,8 @@ CHECKS = {
     ),
     "nobody lives where a recorded actor is between two programs or lives": Check(
         "supervision/awaited.py",
-        "    return cell is not None and not cell.is_dead\n",
-        "    return cell is not None\n",
+        "    if cell is None or cell.is_dead:\n",
+        "    if cell is None:\n",
         BOUND,
         "supervisor_is_restarted and later",
     ),
@@ -60,8 +159,57 @@ CHECKS = {
         "supervision/dynamic.py",
         "            if known is None or known.cell is not None or known.row is None:\n",
         "            if True:\n",
+        EXPECTED,
+        "in_a_process",
+    ),
+    "who comes back is found before its life begins": Check(
+        "supervision/dynamic.py",
+        "        self._expect(come)\n",
+        "",
+        EXPECTED,
+        "in_the_next_program and recorded",
+    ),
+    "who only has its address is not there for whoever is bound to it": Check(
+        "supervision/awaited.py",
+        "    return one is None or not one.comes  #",
+        "    return True  #",
+        EXPECTED,
+        "waits_for_another_one",
+    ),
+    "who has its address is still bound when its life begins": Check(
+        "supervision/supervisor.py",
+        "            bind_expected(self.ctx._cell, one, cell)\n",
+        "            pass\n",
         BOUND,
-        "program_of_the_book",
+        "in_the_next_program and other",
+    ),
+    "what is said to a recorded address before its life is recorded": Check(
+        "checkpoint/home/journal_home.py",
+        "            cell.admit = admit_unread\n",
+        "            pass\n",
+        EXPECTED,
+        "told_meanwhile_is_kept and nobody",
+    ),
+    "what a recorded actor says to an address whose home is unread is kept with its turn": Check(
+        "checkpoint/home/outputs.py",
+        "is_there = not target.is_dead and not is_unread(target)",
+        "is_there = not target.is_dead",
+        EXPECTED,
+        "said_once and Tell",
+    ),
+    "what it asks there is kept with its turn": Check(
+        "checkpoint/home/outputs.py",
+        "        if (target.is_dead or is_unread(target)) and switch_of",
+        "        if target.is_dead and switch_of",
+        EXPECTED,
+        "said_once and Add",
+    ),
+    "a send to an unread address is accepted when it is safe": Check(
+        "checkpoint/home/journal_home.py",
+        "        if is_unread(cell):\n",
+        "        if False:\n",
+        EXPECTED,
+        "told_meanwhile_is_kept and nobody",
     ),
     "the page of a turn with an effect out is put back behind a question": Check(
         "checkpoint/life/glances.py",
@@ -791,6 +939,69 @@ CHECKS = {
         REPLICAS,
         "test_what_a_replica_says",
     ),
+    "the ends of many children by one cause are one restart": Check(
+        "supervision/supervisor.py",
+        "        if not self._causes.is_counted(reason.common_cause, one.spec.id, now, period):\n",
+        "        if True:\n",
+        FORK_SERVER,
+        "test_many_children",
+    ),
+    "the restart that one cause leads to begins with the first child that it has struck": Check(
+        "supervision/supervisor.py",
+        "order.index(self._first_struck(one, reason))",
+        "order.index(one)",
+        FORK_SERVER,
+        "test_a_group_is_restarted_once",
+    ),
+    "all that have ended with their fork server are told of at once": Check(
+        "actors/process/worker_pool.py",
+        "        if self.end.orphaned is not None:\n            self._workers",
+        "        if False:\n            self._workers",
+        FORK_SERVER,
+        "test_a_group_is_restarted_once",
+    ),
+    "a process whose socket another one has is told of with the others all the same": Check(
+        "actors/process/worker_pool.py",
+        "        if late or all(",
+        "        if all(",
+        FORK_SERVER,
+        "test_a_stray",
+    ),
+    "a supervisor gives up because of what its children have ended by": Check(
+        "supervision/supervisor.py",
+        "Shutdown(why, reason.common_cause)",
+        "Shutdown(why)",
+        FORK_SERVER,
+        "test_supervisors_that_give_up",
+    ),
+    "starts that fail by one cause are one restart": Check(
+        "supervision/supervisor.py",
+        "error.struck_by or one.cell.extra().reason.common_cause",
+        "error.struck_by",
+        FORK_SERVER,
+        "test_starts_that_fail",
+    ),
+    "a protected actor that could not be started has ended by what its replicas have": Check(
+        "ftm/group/group_place.py",
+        "next((end for end in (*ends, crash(failed)) if end.common_cause), KILLED)",
+        "KILLED",
+        FORK_SERVER,
+        "test_protected_actors",
+    ),
+    "the message in its turn has no part in the end of the fork server": Check(
+        "actors/exit_reasons.py",
+        "        return bool(self.common_cause)\n",
+        "        return False\n",
+        FORK_SERVER,
+        "test_the_message_in_its_turn",
+    ),
+    "a child that ends once more by the same cause counts once more": Check(
+        "supervision/intensity.py",
+        "        is_new = cause not in self._counted or child in children\n",
+        "        is_new = cause not in self._counted\n",
+        "tests/supervision/test_intensity.py",
+        "test_a_common_cause",
+    ),
     "two looks at threads are alike": Check(
         "testing/threads.py",
         "        if not at_work and before:\n",
@@ -835,7 +1046,7 @@ CHECKS = {
     ),
     "nobody waits for whom a transaction has bound it to": Check(
         "supervision/awaited.py",
-        "            if port in one.spec.late or lives(node, path):\n",
+        "            if port in one.spec.late or lives(node, self._listed, path):\n",
         "            if node.find(path) is not None:\n",
         KEPT,
         "test_a_binding_that_a_transaction_has_made_outlives_the_supervisor and last and task",
@@ -1258,10 +1469,24 @@ CHECKS = {
     ),
     "a program waits for whoever gets its lines": Check(
         "supervision/services/program_lines.py",
-        "            self._hold()\n",
-        "            pass\n",
+        "        if self._waiting >= MOST:\n            self._hold()\n",
+        "",
         LINES,
         "test_a_program_that_prints_faster",
+    ),
+    "first lines wait for whoever gets them": Check(
+        "supervision/services/program_lines.py",
+        "        if first is None:\n",
+        "        if True:\n",
+        LINES,
+        "test_the_first_lines_are_kept",
+    ),
+    "lines that are not to be logged are not": Check(
+        "system/logs.py",
+        "                if event.is_logged:\n",
+        "                if True:\n",
+        LINES,
+        "test_lines_are_logged_unless",
     ),
     "a child elsewhere has its name before it starts": Check(
         "actors/kernel/address_host.py",

@@ -77,6 +77,31 @@ async def test_crashes_refusals_and_letters_are_counted() -> None:
         assert found.value("holdfast_dead_letters_total") == 1
 
 
+@pytest.mark.parametrize("recovery", [None, hf.hybrid()])
+@pytest.mark.parametrize("overflow", ["reject", "drop_newest", "drop_oldest"])
+async def test_shed_load_is_counted_by_class(recovery: Any, overflow: Any) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        metrics = Metrics(system)
+        template = hf.child(None, hf.start(Account))
+        some = await system.start(hf.dynamic("some", template=template, max_children=1))
+        await some.ask(hf.StartChild())
+        with pytest.raises(hf.errors.MaxChildren):
+            await some.ask(hf.StartChild())
+        mailbox = hf.bounded(2, overflow=overflow)
+        bob = await system.start(hf.child("bob", hf.start(Account), recovery=recovery, mailbox=mailbox))
+        await system.suspend(bob)
+        asked = [bob.ask(Add()) for _ in range(5)]
+        await asyncio.sleep(0.1)
+        await system.resume(bob)
+        ends = await asyncio.gather(*asked, return_exceptions=True)
+        refused = sum(isinstance(end, hf.MailboxFull) for end in ends)
+        assert refused in (2, 3)  # A recorded actor has one in hand besides.
+        found = await scraped(metrics)
+        name = f"{Account.__module__}.{Account.__qualname__}"
+        assert found.value("holdfast_no_room_total", **{"where": "mailbox", "class": name}) == refused
+        assert found.value("holdfast_no_room_total", **{"where": "children", "class": name}) == 1
+
+
 async def test_protected_actors_are_whole_or_not() -> None:
     async with hf.ActorSystem("app", log=False) as system:
         metrics = Metrics(system)

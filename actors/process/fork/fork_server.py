@@ -19,6 +19,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 
 from ...errors import ProcessUnavailable
+from ...exit_reasons import Signal
 from ...streams import check_can_watch
 from .boot import HEADER, PacketKind, receive
 from .child_processes import signal_by
@@ -82,6 +83,14 @@ class ForkServer:
         if self._process is None:
             raise ProcessUnavailable("the fork server has not been started")
         return self._process.pid
+
+    @property
+    def died_of(self) -> str:
+        """What has ended the server, as far as that is known."""
+        returncode = None if self._process is None else self._process.returncode
+        if returncode is None:
+            return "cause unknown"
+        return str(Signal(-returncode)) if returncode < 0 else f"exit code {returncode}"
 
     def has_ended(self) -> bool:
         """Whether the server is dead, even if the loop has not come to see it yet."""
@@ -171,7 +180,7 @@ class ForkServer:
                 os.killpg(child.pid, signal.SIGKILL)
         self._forks.children.clear()
         was_ready = self._ready.done() and not self._ready.cancelled() and self._ready.exception() is None
-        self._fail_all(f"the fork server (pid {self._process.pid}) has died ({_cause(self._process.returncode)})")
+        self._fail_all(f"the fork server (pid {self._process.pid}) has died ({self.died_of})")
         if was_ready and not self._stopping:
             self._on_lost()
 
@@ -337,9 +346,3 @@ class ForkServer:
     def _report(self, pid: int, status: int) -> None:
         if self._forks.children.pop(pid, None) is not None:
             self._on_exit(pid, status)
-
-
-def _cause(returncode: int | None) -> str:
-    if returncode is None:
-        return "cause unknown"
-    return f"signal {-returncode}" if returncode < 0 else f"exit code {returncode}"

@@ -372,9 +372,9 @@ class RelayedAsk(Ask, eq=False):
         return self.is_over
 
     def answer(self, reply: object) -> None:
-        from ...kernel.envelope import ReplyHandle
+        from ...kernel.envelope import AskHandle
 
-        if type(reply) is ReplyHandle or self.is_over:
+        if type(reply) is AskHandle or self.is_over:
             return
         self.is_over = True
         connection = self.peer.connection

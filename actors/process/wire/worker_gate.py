@@ -473,6 +473,7 @@ COMMANDS: Final[dict[str, Callable[[WorkerGate, str, frames.Command], None]]] = 
     "born": _born,
     "gone": _gone,
     "undone": _below,
+    "waits": _own,
     "name": _named,
     "keep": _keep,
     "stop": _order,

@@ -93,7 +93,7 @@ async def test_a_process_of_whose_end_nobody_has_told_in_time_leaves_nothing_ope
 
     def late(worker: worker_pool.Worker) -> None:
         if worker.end.is_complete:
-            worker._bury()
+            worker.bury()
 
     monkeypatch.setattr(worker_pool, "REAPED_WITHIN", 0.05)
     async with hf.ActorSystem("app", log=False) as system:

@@ -20,14 +20,14 @@ class EventQuota:
         self._burst, self._per_second, self._then = float(burst), per_second, now
         self._left = float(burst)
 
-    def take(self, now: float, *, least: float = 1.0) -> bool:
-        """Take a token, if at least `least` of them are there."""
+    def take(self, now: float, *, least: float = 1.0, cost: float = 1.0) -> bool:
+        """Take `cost` tokens, if at least `least` of them are there."""
         if now > self._then:
             self._left = min(self._burst, self._left + (now - self._then) * self._per_second)
             self._then = now
         if self._left < least:
             return False
-        self._left -= 1.0
+        self._left -= cost
         return True
 
     def has(self, now: float, least: float) -> bool:

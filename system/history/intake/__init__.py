@@ -1,0 +1,1 @@
+"""How much of what happens the history takes in."""
