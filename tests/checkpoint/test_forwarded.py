@@ -73,7 +73,7 @@ async def started(system: hf.ActorSystem, mailbox: Any) -> hf.ActorRef[Any]:
 @pytest.mark.parametrize("mailbox", [None, hf.bounded(8)], ids=["unbounded", "bounded"])
 @pytest.mark.parametrize("how", ["ask", "tell", "from a turn"])
 async def test_what_is_handed_on_is_not_lost_with_the_program(how: str, mailbox: Any, tmp_path: Path) -> None:
-    engine = Ends(tmp_path / "app.db")
+    engine: Any = Ends(tmp_path / "app.db")
     with contextlib.suppress(hf.HoldfastError):
         async with hf.ActorSystem("app", log=False, store=engine) as system:
             await started(system, mailbox)
