@@ -11,8 +11,7 @@ from ...actors.events import RecordsMapped, RecoveryFailed
 from ...actors.kernel.cell import DOWN, GONE, Cell
 from ...actors.persistence import CHILDREN, ENTRIES, child_key
 from ..address_tree import AddressTree
-from ..addresses import Addresses, is_of_actor, renamed
-from ..durable_links import RegisteredKeys
+from ..addresses import Addresses, RegisteredKeys, is_of_actor, renamed
 from ..group_commit import Commits, Unkept
 from ..inputs import HomeJournal
 from ..journal import Saved, StoreEngine
@@ -81,7 +80,7 @@ class Homes:
         self._stored = set(filter(is_of_actor, journal.addresses()))
         self._known = AddressTree(self._stored)  # with those at which somebody was started since
         self._noted = AddressTree(key.removeprefix(CHILDREN) for key in journal.notes(CHILDREN))  # children
-        self._entries = RegisteredKeys(self.journal)
+        self._entries = RegisteredKeys(journal)
         self.groups = Groups(self)
         self.rejoin = Rejoin(self)
         self.far = FarMail(self)
