@@ -162,7 +162,8 @@ async def watch(
         alerts: whether alerts from outside count (`OutsideAlert` on `/alerts`): while one fires about a component,
             `ok(COMPONENT.alerts)` does not hold.
         hung_after: seconds after which an actor that is still in the same turn counts as not running, such as one that
-            others ask in vain. None: nothing takes too long.
+            others ask in vain; time in which the turn rests, as it has said, does not count. None: nothing takes too
+            long.
         name: of the supervisor that is started.
         options: those of `tree`.
 

@@ -52,8 +52,8 @@ from ..cluster.silence import SilenceOfServers
 from ..supervision.admin import NoSuchChild, RemoveChild, StartChild
 from ..supervision.children import tell_stopped
 from ..supervision.patience import end_within, told_if_held
-from ..supervision.repeatable import bears_repetition
 from ..supervision.respec import respec
+from ..supervision.services.repeatable import bears_repetition
 from ..supervision.spec import ChildSpec, Flags
 from ..supervision.supervisor import Supervisor, kill_starting
 from .controls import Controls

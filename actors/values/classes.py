@@ -70,7 +70,7 @@ def class_mark(kind: Any) -> ExtType | None:
         return STRUCT
     if hasattr(kind, "_fields") and issubclass(kind, tuple):
         return NAMED
-    if (dataclasses.is_dataclass(kind) and kind.__new__ is object.__new__) or issubclass(kind, Kept):
+    if issubclass(kind, Kept) or (dataclasses.is_dataclass(kind) and kind.__new__ is object.__new__):
         return DATACLASS
     return None
 

@@ -12,6 +12,7 @@ from ...actors.kernel.cell import DOWN, GONE, Cell
 from ...actors.persistence import CHILDREN, ENTRIES, child_key
 from ..address_tree import AddressTree
 from ..addresses import Addresses, is_of_actor, renamed
+from ..durable_links import RegisteredKeys
 from ..group_commit import Commits, Unkept
 from ..inputs import HomeJournal
 from ..journal import Saved, StoreEngine
@@ -28,7 +29,6 @@ from .capacity import HomeBound
 from .disposal import Erased, Erasures, drop_all, forget_home, put_into_quarantine
 from .held_messages import Holding, end_wait, let_go
 from .quarantine import Quarantine
-from .registered_keys import RegisteredKeys
 from .switch import Switch
 
 if TYPE_CHECKING:

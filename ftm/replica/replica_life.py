@@ -136,7 +136,7 @@ class ServerLife(Life):
     def only_rests(self, stranded: Collection[int]) -> bool:
         """Whether the turn in hand waits for moments, messages or these asks, and nothing else of this life is out."""
         waits = self.waits
-        out = [k for (turn, k), (future, _) in waits.outcomes.items() if not future.done()]
+        out = [k for (_, k), (future, _) in waits.outcomes.items() if not future.done()]
         resting = waits.resting + sum(k in stranded for k in out)
         return 0 < resting == len(out) and not (self.pipes or self.has_begun_tasks)
 

@@ -76,7 +76,7 @@ class Gate(hf.Actor):
     """Hands on what comes."""
 
     @hf.on(Pass)
-    def hand_on(self, message: Pass) -> None:
+    def hand_on(self, message: Pass) -> Any:
         self.ctx.forward(self.ctx.find(RECEIVERS[message.to], Receiver))
 
 
@@ -161,7 +161,7 @@ def sender(name: str, kind: str, n: int = 0) -> hf.ChildSpec:
         "lfr": {"mechanism": hf.ftm.LFR()},
     }
     own = kinds.get(kind, {})
-    start = hf.start(Gate) if name == "gate" else hf.start(Sender, name, n)
+    start: Any = hf.start(Gate) if name == "gate" else hf.start(Sender, name, n)
     return hf.child(name, start, recovery=hf.hybrid(interval=0.1), **own)
 
 

@@ -40,7 +40,7 @@ class Ends:
         return self.is_over.is_set()
 
 
-def is_end(entry: Entry) -> bool:
+def is_end(entry: tuple[Any, ...]) -> bool:
     """Whether a row ends a turn that was not the first one."""
     return (entry[0] in ("end", "ends") and entry[1] > 0) or (entry[0] == "in" and len(entry) > 8)
 
@@ -49,7 +49,7 @@ class Gate(hf.Actor):
     box: hf.Binding[Doer]
 
     @hf.on(Note)
-    def note(self, message: Note) -> None:
+    def note(self, message: Note) -> Any:
         self.ctx.forward(self.box)
 
 
@@ -73,9 +73,9 @@ async def started(system: hf.ActorSystem, mailbox: Any) -> hf.ActorRef[Any]:
 @pytest.mark.parametrize("mailbox", [None, hf.bounded(8)], ids=["unbounded", "bounded"])
 @pytest.mark.parametrize("how", ["ask", "tell", "from a turn"])
 async def test_what_is_handed_on_is_not_lost_with_the_program(how: str, mailbox: Any, tmp_path: Path) -> None:
-    engine = Ends(tmp_path / "app.db")
+    engine: Any = Ends(tmp_path / "app.db")
     with contextlib.suppress(hf.HoldfastError):
-        async with hf.ActorSystem("app", log=False, store=engine) as system:  # type: ignore[arg-type]
+        async with hf.ActorSystem("app", log=False, store=engine) as system:
             await started(system, mailbox)
             ref = system.ref("/app/asker" if how == "from a turn" else "/app/gate", hf.Actor)
             if how == "tell":

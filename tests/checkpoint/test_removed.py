@@ -64,7 +64,7 @@ CHECKS = {
         "end and task",
     ),
     "a child that would be there twice is not asked for again": Check(
-        "supervision/repeatable.py",
+        "supervision/services/repeatable.py",
         "return not start.fresh and start.id is not None",
         "return True",
         ORDERS,
@@ -513,8 +513,8 @@ CHECKS = {
     ),
     "who has said that it ends does so in the next program": Check(
         "checkpoint/home/switch.py",
-        "begun, own.wanted, own.past))\n",
-        "begun, None, own.past))\n",
+        "begun, own.wanted, own.past, spent))\n",
+        "begun, None, own.past, spent))\n",
         "tests/checkpoint/test_restart_ends.py",
         "test_it_says_good_bye",
     ),

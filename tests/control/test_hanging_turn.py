@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncGenerator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from typing import Any
 
@@ -72,7 +72,7 @@ CALLS: dict[str, Callable[[hf.ActorSystem, Any], Awaitable[object]]] = {
 
 
 @asynccontextmanager
-async def hanging(place: str) -> AsyncIterator[tuple[hf.ActorSystem, hf.ActorRef[Booking]]]:
+async def hanging(place: str) -> AsyncGenerator[tuple[hf.ActorSystem, hf.ActorRef[Booking]]]:
     """A system, and an actor in it whose turn waits for nobody knows what."""
     recovery = None if place == "task" else hf.hybrid()
     isolation: Any = "process" if place == "process" else "task"

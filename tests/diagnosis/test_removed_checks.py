@@ -397,8 +397,8 @@ CHECKS = {
     ),
     "a start forgets what was seen of those that it is about, and of nobody else": Check(
         "diagnosis/observers/flow.py",
-        "            if word_for(topic) in names:\n                flow.begin(self.now)\n",
-        "            flow.begin(self.now)\n            flow.began = float('inf')\n",
+        "            if word_for(topic) in names:\n                flow.begin(self._time.now())\n",
+        "            flow.begin(self._time.now())\n            flow.began = float('inf')\n",
         FLOW,
         "a_clock_that_has_stopped",
     ),
@@ -411,7 +411,7 @@ CHECKS = {
     ),
     "the time in which nobody listened is no silence": Check(
         "diagnosis/observers/flow.py",
-        "            for flow in self._flows.values():\n                flow.begin(self.now)\n",
+        "            for flow in self._flows.values():\n                flow.begin(self._time.now())\n",
         "",
         FLOW,
         "heard_before",

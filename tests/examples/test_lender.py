@@ -137,7 +137,8 @@ class House:
 
     async def first_has_it(self, **options: Any) -> asyncio.Future[str]:
         going = asyncio.ensure_future(self.borrowers[0].ask(self.page.Go(600.0, **options), timeout=600.0))
-        while not self.barrier._cell.actor.waiting:
+        barrier: Any = self.barrier._cell
+        while not barrier.actor.waiting:
             await asyncio.sleep(0.005)
         return going
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.actors.kernel.envelope import ReplyHandle
+from holdfast.actors.kernel.envelope import AskHandle, ReplyHandle
 from holdfast.ftm.alarms import Diverged
 from holdfast.ftm.bricks.letters import Letter, Sheet
 from holdfast.ftm.bricks.peer_channel import Inbox, Where
@@ -140,7 +140,7 @@ def letter(number: int, floor: int = 1) -> Letter:
 def test_letters_are_taken_in_order_once() -> None:
     inbox, taken = Inbox(), list[int]()
     for number in (2, 1, 2, 3, 1, 5, 5, 4):
-        inbox.take(letter(number), b"", ReplyHandle(None))
+        inbox.take(letter(number), b"", AskHandle(None))
         while (one := inbox.pop()) is not None:
             taken.append(one[0].number)
     assert taken == [1, 2, 3, 4, 5]
@@ -149,10 +149,10 @@ def test_letters_are_taken_in_order_once() -> None:
 
 def test_letters_that_nobody_asks_for_again_are_not_waited_for() -> None:
     inbox = Inbox()
-    inbox.take(letter(4, floor=3), b"", ReplyHandle(None))
+    inbox.take(letter(4, floor=3), b"", AskHandle(None))
     assert inbox.pop() is None
-    inbox.take(letter(5, floor=4), b"", ReplyHandle(None))
+    inbox.take(letter(5, floor=4), b"", AskHandle(None))
     taken = [inbox.pop(), inbox.pop()]
     assert [one[0].number for one in taken if one is not None] == [4, 5]
-    inbox.take(letter(6, floor=6), b"", ReplyHandle(None))
+    inbox.take(letter(6, floor=6), b"", AskHandle(None))
     assert inbox.recall(5) is None, "its answer was heard"

@@ -128,7 +128,7 @@ class Speaker(hf.Actor):
 
 
 def guest(kind: str, why: str, file: str) -> hf.ChildSpec[hf.Actor]:
-    options = KINDS[kind]
+    options: dict[str, Any] = KINDS[kind]
     if why == "bound":
         options = {**options, "bindings": {"desk": "/app/desk"}}
     elif why == "backoff":

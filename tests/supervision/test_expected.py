@@ -219,7 +219,7 @@ async def test_a_service_is_not_ready_while_they_wait(isolation: str, tmp_path: 
 
 async def test_in_a_process_a_start_that_is_asked_for_again_waits_for_its_turn(tmp_path: Path) -> None:
     begun, goes_on = tmp_path / "begun", tmp_path / "begun.goes_on"
-    guests = hf.dynamic("guests", journal=True, template=hf.child(None, hf.start(Slow)))
+    guests = hf.dynamic("guests", journal=True, template=hf.child(None, hf.start(Slow)))  # type: ignore[call-arg]
     starter = hf.child("starter", hf.start(Starter, str(begun)))
     goes_on.touch()
     async with hf.ActorSystem("app", log=False) as system:

@@ -55,7 +55,7 @@ def specs(above: str, isolation: Any) -> list[hf.ChildSpec]:
     return [hf.dynamic("sessions", template=template, journal=True), gate]
 
 
-async def begin(system: hf.ActorSystem, way: str, isolation: Any) -> str:
+async def begin(system: hf.ActorSystem, way: Any, isolation: Any) -> str:
     """Start them by calls, or as the children of one supervisor; returns the address above them."""
     above = "/app" if way == "calls" else "/app/house"
     if way == "calls":

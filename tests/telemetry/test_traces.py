@@ -597,8 +597,8 @@ async def test_a_trace_is_not_in_the_store(traced: Traced, tmp_path: Path) -> No
                 await alice.ask(kind())
         kept = (one for one in export_store(tmp_path / name) if one["record"] == "input")
         fields = [{key: value for key, value in one.items() if key not in ("time", "position")} for one in kept]
-        for one in fields:
-            one["origin"] = one["origin"].rpartition(".")[0]  # Without the moment at which its message came.
+        for one in fields:  # Of an ask the last number is a time.
+            one["origin"] = one["origin"].rpartition(".")[0]
         return sorted(fields, key=lambda one: (one["address"], one["input"]))
 
     plain = await stored("plain", None)

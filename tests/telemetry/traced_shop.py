@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Iterable
+from typing import Any
 
 from opentelemetry import baggage, trace
 from opentelemetry.sdk.trace import ReadableSpan, TracerProvider
@@ -159,7 +160,7 @@ class Clerk(hf.Actor):
 
     @hf.on(TooLate)
     async def too_late(self, message: TooLate) -> None:
-        timer = self.ctx.tell_after(0.0, Note())
+        timer: Any = self.ctx.tell_after(0.0, Note())
         while not timer.is_queued:
             await asyncio.sleep(0)
         timer.cancel()

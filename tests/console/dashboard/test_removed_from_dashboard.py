@@ -305,7 +305,7 @@ CHECKS = {
     ),
     "a turn that goes on and on is suspicious": Check(
         f"{FOLDER}troubles.py",
-        "    if row.turn and seen.now - row.turn_seconds >= LONG_TURN:\n        return 4.0",
+        "    if row.turn and not row.rests and seen.now - row.turn_seconds >= LONG_TURN:\n        return 4.0",
         "    if False:\n        return 4.0",
         TROUBLES,
         "test_who_looks_ill_is_asked",

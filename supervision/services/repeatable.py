@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-from ..actors.kernel.codec import Codec
-from ..actors.kernel.message import Message, message_name
-from .admin import (
+from ...actors.kernel.codec import Codec
+from ...actors.kernel.message import Message, message_name
+from ..admin import (
     CountChildren,
     DeleteChild,
     EndedChildren,
@@ -19,9 +19,9 @@ from .admin import (
     TerminateChild,
     WhichChildren,
 )
-from .services.partition import CountPartitions, ResizePartitions, Route
-from .services.pool import PoolInfo, ResizePool
-from .services.registrar import Count, DeleteMeta, DropEntries, Find, GetMeta, Lock, PutMeta, Register
+from .partition import CountPartitions, ResizePartitions, Route
+from .pool import PoolInfo, ResizePool
+from .registrar import Count, DeleteMeta, DropEntries, Find, GetMeta, Lock, PutMeta, Register
 
 ALWAYS: Final[tuple[type[Message[Any]], ...]] = (
     *(WhichChildren, EndedChildren, CountChildren, GetChildSpec, TerminateChild, DeleteChild),
