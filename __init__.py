@@ -60,7 +60,6 @@ from holdfast.actors.kernel.timers import Timer
 from holdfast.actors.process.resource_limits import Limits
 from holdfast.actors.values.renamed import renamed
 from holdfast.checkpoint.method import Method, checkpoint_only, fresh, hybrid, replay_only
-from holdfast.checkpoint.recovery_file import load_recovery
 from holdfast.supervision.admin import DeleteChild, RestartChild, StartChild, TerminateChild, WhichChildren
 from holdfast.supervision.config import load_tree
 from holdfast.supervision.dynamic import dynamic
@@ -141,7 +140,6 @@ __all__ = [
     "fencing_token",
     "fresh",
     "hybrid",
-    "load_recovery",
     "load_tree",
     "on",
     "renamed",

@@ -1,7 +1,7 @@
 """Crash recovery: snapshots, journals, stores and replay."""
 
 from .home.quarantine import QuarantinedMessage
-from .recovery_file import RecoveryFile
+from .recovery_file import RecoveryFile, load_recovery
 from .recovery_settings import Held, RecoveryHooks, RecoveryStep, SafeState, held, recovery_hooks, safe_state
 
 __all__ = [
@@ -12,6 +12,7 @@ __all__ = [
     "RecoveryStep",
     "SafeState",
     "held",
+    "load_recovery",
     "recovery_hooks",
     "safe_state",
 ]

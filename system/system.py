@@ -63,7 +63,7 @@ from .history.recorder import HistoryRecorder, expect_end
 from .last_lines.line_calls import LineCalls
 from .last_lines.line_memory import LineMemory
 from .live_moves import Moves
-from .logs import LogSink
+from .log.log_sink import LogSink
 from .mechanism_notes import MechanismNotes, check_no_part
 from .options import ProgramRole, SystemOptions
 from .portal import ThreadPortal

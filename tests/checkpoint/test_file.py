@@ -219,7 +219,7 @@ def test_every_setting_of_a_method_can_stand_in_the_file() -> None:
 )
 def test_what_is_wrong_in_a_file_is_refused_by_line_and_setting(tmp_path: Path, text: str, problem: str) -> None:
     with pytest.raises(hf.SpecError, match=problem):
-        hf.load_recovery(written(tmp_path, text))
+        hf.checkpoint.load_recovery(written(tmp_path, text))
 
 
 @pytest.mark.parametrize(
@@ -287,7 +287,7 @@ async def test_a_fresh_start_and_a_change_of_specs_see_the_file_too(tmp_path: Pa
         await top.ask(hf.RestartChild("x"))
         assert await system.ref("/app/top/x", Doer).ask(Seen()) == ["one"]
     for fresh in (False, True):
-        async with hf.ActorSystem("app", log=False, store=store, recovery=hf.load_recovery(path)) as system:
+        async with hf.ActorSystem("app", log=False, store=store, recovery=hf.checkpoint.load_recovery(path)) as system:
             await system.start(hf.supervisor("top", children=[spec]), fresh=fresh)
             assert await system.ref("/app/top/x", Doer).ask(Seen()) == ([] if fresh else ["one"])
 

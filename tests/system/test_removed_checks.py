@@ -345,7 +345,7 @@ CHECKS = {
         "both_end and moved-sleep",
     ),
     "a recovery that fails is logged once": Check(
-        "system/logs.py",
+        "system/log/log_sink.py",
         "            if event.reason in crash.reason:\n                return\n",
         "",
         "tests/system/test_logs.py",
@@ -1482,7 +1482,7 @@ CHECKS = {
         "test_the_first_lines_are_kept",
     ),
     "lines that are not to be logged are not": Check(
-        "system/logs.py",
+        "system/log/log_sink.py",
         "                if event.is_logged:\n",
         "                if True:\n",
         LINES,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 
-from ..actors.events import Recovered
+from ...actors.events import Recovered
 
 QUIET = 1.0
 """Seconds without one more recovery after which those of a supervisor are told of."""

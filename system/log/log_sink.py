@@ -8,9 +8,9 @@ import math
 import sys
 from typing import Any
 
-from ..actors.control.trace_tail import tail_of
-from ..actors.errors import portable
-from ..actors.events import (
+from ...actors.control.trace_tail import tail_of
+from ...actors.errors import portable
+from ...actors.events import (
     ActorCrashed,
     AutoShutdown,
     BindingAwaited,
@@ -60,10 +60,10 @@ from ..actors.events import (
     TurnSlow,
     TurnWaits,
 )
-from ..actors.exit_reasons import Crash
-from ..actors.kernel.envelope import Item, item_name
-from ..actors.kernel.message import Message, MessageText, message_of
-from ..ftm.alarms import (
+from ...actors.exit_reasons import Crash
+from ...actors.kernel.envelope import Item, item_name
+from ...actors.kernel.message import Message, MessageText, message_of
+from ...ftm.alarms import (
     Diverged,
     Masked,
     NondeterminismFound,
@@ -74,7 +74,7 @@ from ..ftm.alarms import (
     RequestsDropped,
     StatesDiffer,
 )
-from ..ftm.events import (
+from ...ftm.events import (
     BackgroundWorkLost,
     FailedOver,
     MechanismSettled,
@@ -83,12 +83,12 @@ from ..ftm.events import (
     ReplicaLost,
     TurnHung,
 )
-from .history.writer import HistoryNotKept
-from .last_lines.line_memory import LineLevel, LineMemory
-from .mechanism_notes import AdaptationUndone
-from .recovered import Recoveries
-from .specification import SpecificationNotKept
-from .transaction.events import ScriptLoaded, TransactionCommitted, TransactionRolledBack
+from ..history.writer import HistoryNotKept
+from ..last_lines.line_memory import LineLevel, LineMemory
+from ..mechanism_notes import AdaptationUndone
+from ..specification import SpecificationNotKept
+from ..transaction.events import ScriptLoaded, TransactionCommitted, TransactionRolledBack
+from .log_recoveries import Recoveries
 
 BURST = 10
 """Records of one kind within a second; what is more is counted and told with the next one."""

@@ -1,0 +1,1 @@
+"""The log: what operators want to see of the events, as records."""
