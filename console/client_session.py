@@ -17,11 +17,11 @@ from ..actors.kernel.actor import Actor
 from ..system.history.authors import ACTING, OPERATOR
 from ..system.history.evidence import PutAside, put_aside
 from ..system.transaction.change import Change
-from .asking import ask_by_name, tell_by_name
 from .declare.tree_plan import declare
 from .inspection import inspected
 from .overview import look_at
 from .restarting import restart_actor
+from .service.named_messages import ask_by_name, tell_by_name
 from .trust import Needed, trusted_imports
 from .wire import (
     About,

@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from ..actors.errors import BadMessage, SpecError
-from ..actors.kernel.actor import Actor
-from ..actors.kernel.message import Message, message_name
-from ..actors.kernel.node import cell_kind
-from ..actors.kernel.ref import ActorRef
+from ...actors.errors import BadMessage, SpecError
+from ...actors.kernel.actor import Actor
+from ...actors.kernel.message import Message, message_name
+from ...actors.kernel.node import cell_kind
+from ...actors.kernel.ref import ActorRef
 
 if TYPE_CHECKING:
-    from ..system.system import ActorSystem
+    from ...system.system import ActorSystem
 
 LARGEST: Final = 1 << 63
 """From this size on a whole number is told as Python writes it."""
