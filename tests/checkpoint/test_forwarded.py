@@ -66,7 +66,7 @@ async def started(system: hf.ActorSystem, mailbox: Any) -> hf.ActorRef[Any]:
     recovery: Any = {"recovery": hf.hybrid(interval=3600.0)}
     box = await system.start(hf.child("box", hf.start(Doer), mailbox=mailbox, **recovery))
     await system.start(hf.child("gate", hf.start(Gate), bindings={"box": "/app/box"}, **recovery))
-    await system.start(hf.child("asker", hf.start(Asker), bindings={"gate": "/app/gate"}, **recovery))
+    await system.start(hf.child("asker", hf.start(Asker), bindings={"gate": "/app/gate"}, shutdown=0.1, **recovery))
     return box
 
 

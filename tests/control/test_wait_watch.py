@@ -9,7 +9,7 @@ import pytest
 
 import holdfast as hf
 
-LIMIT = 0.4
+LIMIT = 0.2
 PLACES: dict[str, dict[str, Any]] = {
     "task": {},
     "recorded": {"recovery": hf.hybrid()},
@@ -48,12 +48,12 @@ async def test_a_turn_that_waits_for_too_long_is_told_of(place: str, how: str) -
     async with hf.ActorSystem("app", log=False, watch_waits=LIMIT) as system:
         till = await system.start(hf.child("till", hf.start(Till), **PLACES[place]))
         with system.events() as events:
-            asked = till.ask(Pay(3.0, how), timeout=60.0)
+            asked = till.ask(Pay(1.2, how), timeout=60.0)
             for least in (LIMIT, 2 * LIMIT):
                 told = await events.until(hf.events.TurnWaits, timeout=20.0)
                 assert told.address.startswith("/app/till"), told
                 assert told.message.endswith("test_wait_watch.Pay")
-                assert least <= told.seconds < 3.5
+                assert least <= told.seconds
                 assert "asyncio.sleep" in told.at or "ctx.effect" in told.at
             assert await asked == "paid"
         assert (await system.get_status(till)).life == 1
@@ -63,8 +63,8 @@ async def test_a_turn_that_waits_for_too_long_is_told_of(place: str, how: str) -
 async def test_turns_that_end_in_time_are_not(place: str) -> None:
     async with hf.ActorSystem("app", log=False, watch_waits=LIMIT) as system:
         till = await system.start(hf.child("till", hf.start(Till), **PLACES[place]))
-        for _ in range(12):
-            await till.ask(Pay(0.1), timeout=60.0)
+        for _ in range(10):
+            await till.ask(Pay(0.05), timeout=60.0)
         assert system.history(kinds=["TurnWaits"]).events == []
 
 
@@ -72,7 +72,7 @@ async def test_turns_that_end_in_time_are_not(place: str) -> None:
 async def test_nor_is_one_that_rests_as_long_as_it_has_said_itself(place: str) -> None:
     async with hf.ActorSystem("app", log=False, watch_waits=LIMIT) as system:
         till = await system.start(hf.child("till", hf.start(Till), **PLACES[place]))
-        assert await till.ask(Pay(1.5, "rest"), timeout=60.0) == "paid"
+        assert await till.ask(Pay(0.6, "rest"), timeout=60.0) == "paid"
         assert system.history(kinds=["TurnWaits"]).events == []
 
 

@@ -229,6 +229,9 @@ async def test_in_a_process_a_start_that_is_asked_for_again_waits_for_its_turn(t
             with contextlib.suppress(hf.errors.AlreadyStarted):
                 order = hf.StartChild(id=name, args=(str(goes_on),))
                 await system.ref("/app/house/guests", hf.supervision.DynamicSupervisor).ask(order)
+        async with asyncio.timeout(30.0):
+            while not begun.exists():
+                await asyncio.sleep(0.01)
         begun.unlink()
         goes_on.unlink()
         ref.kill()

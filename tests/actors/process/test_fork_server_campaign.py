@@ -13,6 +13,8 @@ import signal
 from collections import Counter
 from typing import Any
 
+import pytest
+
 import holdfast as hf
 from holdfast.actors.events import ChildRestarted, MessageQuarantined, SupervisorGaveUp
 from tests.actors.process.fork_players import Effecting, Taken, Tally, Tallying
@@ -61,6 +63,7 @@ class Load:
                 self.counts["started and stopped"] += 1
 
 
+@pytest.mark.asyncio(loop_factories=["uvloop", "asyncio"] if KILLS > 2 else ["uvloop"])
 async def test_nothing_is_lost_and_nobody_gives_up() -> None:
     draw, load = random.Random(SEED), Load()
     method = hf.hybrid()

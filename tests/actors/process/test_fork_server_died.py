@@ -130,7 +130,7 @@ async def test_protected_actors_whose_start_fails_by_a_second_death_count_once()
         groups = [
             hf.child(f"c{n}", hf.start(Counter), mechanism=hf.ftm.PBR(), recovery=hf.hybrid()) for n in range(MANY)
         ]
-        await system.start(hf.supervisor("group", children=groups, intensity=2, period=600.0))
+        await system.start(hf.supervisor("group", children=groups, intensity=3, period=600.0))
         workers = system._workers
         first = workers._server
         assert first is not None

@@ -80,7 +80,7 @@ async def test_that_a_quick_topic_falls_silent_is_seen_soon_after(event: str) ->
         assert [one.bad for one in (await watching.diagnosis()).candidates] == [("source",)]
 
 
-@pytest.mark.asyncio(loop_factories=["asyncio", "uvloop"])
+@pytest.mark.asyncio(loop_factories=["uvloop"])
 async def test_time_in_which_the_loop_itself_was_late_is_no_silence_of_a_topic() -> None:
     async with hf.ActorSystem("t", log=False) as system:
         source, baselines = await started(system), Baselines()
