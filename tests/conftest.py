@@ -61,6 +61,42 @@ hypothesis.settings.register_profile("random", REPEATABLE, derandomize=False)
 RANDOM = os.environ.get("HOLDFAST_RANDOM", "")
 hypothesis.settings.load_profile("random" if RANDOM else "repeatable")
 
+LONGEST = (
+    "testing/stores/test_judged.py",
+    "test_docs.py",
+    "migration/test_moved_supervisors.py",
+    "diagnosis/repair/test_hung_turns.py",
+    "console/test_operate.py",
+    "migration/test_moved_kinds.py",
+    "console/test_service.py",
+    "checkpoint/test_chunks_kept.py",
+    "console/test_command_line_page.py",
+    "ftm/test_bad_changes.py",
+    "ftm/test_probation.py",
+    "migration/test_far_moves.py",
+    "checkpoint/test_kills.py",
+    "system/test_moved_replicas.py",
+    "checkpoint/test_order.py",
+    "testing/test_plugins_together.py",
+    "test_examples.py",
+    "cluster/machines/test_machine_faults.py",
+    "history/test_why_live.py",
+    "diagnosis/observers/test_kinds.py",
+    "upgrades/test_what_a_change_does.py",
+    "cluster/test_servers_gone.py",
+    "checkpoint/test_evolving.py",
+    "console/dashboard/test_browser.py",
+    "ftm/test_put_back.py",
+    "checkpoint/test_large_states.py",
+    "testing/machines/test_machine.py",
+    "migration/test_moves_at_odds.py",
+    "checkpoint/test_engines.py",
+    "cluster/test_engine_on_nats.py",
+    "test_package.py",
+    "test_soak.py",
+)
+"""Files that take long for the tests they have, longest first: if one were begun last, it alone would be waited for."""
+
 LOOP = "_asyncio_loop_factory"  # the parameter that pytest-asyncio adds
 UNDER_BOTH = Path(__file__).parent / "actors"
 
@@ -77,6 +113,8 @@ def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "pairs: each pair of values of two parameters is enough (tests/pairs.py)")
     if RANDOM == "1":
         os.environ["HOLDFAST_RANDOM"] = str(random.SystemRandom().randrange(2, 2**32))
+    if config.pluginmanager.hasplugin("xdist"):
+        config.option.loadscopereorder = False  # The order is that of `_longest_first`.
     if RANDOM and config.getoption("hypothesis_seed") is None:
         config.option.hypothesis_seed = os.environ["HOLDFAST_RANDOM"]
 
@@ -111,6 +149,18 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if dropped:
         config.hook.pytest_deselected(items=list(dropped))
         items[:] = [item for item in items if item not in dropped]
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        _longest_first(items)
+
+
+def _longest_first(items: list[pytest.Item]) -> None:
+    """Put files in front that take long, and then those with many tests: no worker is left with much at the end."""
+    files: defaultdict[str, list[pytest.Item]] = defaultdict(list)
+    for item in items:
+        files[item.nodeid.partition("::")[0].removeprefix("tests/")].append(item)
+    places = {name: place for place, name in enumerate(LONGEST)}
+    order = sorted(files, key=lambda name: (places.get(name, len(places)), -len(files[name])))
+    items[:] = [item for name in order for item in files[name]]
 
 
 def _beyond_pairs(items: list[pytest.Item]) -> set[pytest.Item]:
