@@ -58,6 +58,7 @@ class Addresses:
         keys = {at.removeprefix(KEY): key.decode() for at, key in journal.notes(KEY).items()}
         self._keys = journal.keys if isinstance(journal, Called) else {}  # Of what is in memory only, nothing is read.
         self._keys.update(keys)
+        self.registered = RegisteredKeys(journal)
         self._watched: set[str] = set()
         for path in self._left:
             self._watch(path)

@@ -64,14 +64,14 @@ class WaitWatch:
         self._task: asyncio.Task[None] | None = None
 
     def open(self) -> None:
-        """Begin to look."""
+        """Begin to look, if there is a limit; each look is a small part of that apart."""
         if self._limit is not None:
             node = self._node
             work = self._look_on(self._limit)
             self._task = node.loop.create_task(work, name="watch of waits", context=node.base_context.copy())
 
     def close(self) -> None:
-        """Look no more."""
+        """Look no more; a look that is under way is given up."""
         if self._task is not None:
             self._task.cancel()
 

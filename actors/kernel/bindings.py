@@ -108,14 +108,14 @@ MOST_ORDERED: int = 64
 
 def note_order(giver: Cell, to: Cell) -> None:
     """Note that an actor has given an order to another one."""
-    known = giver.extra().ordered
+    known = giver.extra().ties.ordered
     if len(known) < MOST_ORDERED:
         known[to.path] = None
 
 
 def ordered_by(giver: Cell) -> list[str]:
     """The addresses to which an actor has given orders since the system has begun, as far as this process knows."""
-    return [] if giver.more is None or not giver.more.has_more else list(giver.more.ordered)
+    return [] if giver.more is None or not giver.more.has_more else list(giver.more.ties.ordered)
 
 
 def noting(handler: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:

@@ -247,7 +247,6 @@ class More:
         "enders",
         "has_more",
         "last",
-        "ordered",
         "outlet",
         "reason",
         "start",
@@ -265,7 +264,6 @@ class More:
     belongings: Belongings
     bindings: dict[str, Cell]
     calls: list[QueuedOrder]  # control that waits for the actor's process to be up
-    ordered: dict[str, None]  # addresses to which it has given orders
     ties: Ties
 
     def __init__(self) -> None:
@@ -301,7 +299,6 @@ _MADE_LATER: dict[str, Callable[[], Any]] = {
     "belongings": Belongings,
     "bindings": dict,
     "calls": list,
-    "ordered": dict,
     "ties": Ties,
 }
 

@@ -57,14 +57,15 @@ class LifeMonitor(Monitor):
 
 
 class Ties:
-    """What binds the actors of an address to others: links, who watches them, and whom they watch."""
+    """What binds the actors of an address to others: links, who watches them, and whom they watch or have ordered."""
 
-    __slots__ = ("links", "monitors", "watching")
+    __slots__ = ("links", "monitors", "ordered", "watching")
 
     def __init__(self) -> None:
         self.links: dict[Cell, str] = {}  # and the address that each is known by here, also if it has moved
         self.monitors: list[LifeMonitor] = []
         self.watching: dict[LifeMonitor, None] = {}
+        self.ordered: dict[str, None] = {}  # addresses to which it has given orders
 
 
 def monitor(watcher: Cell, target: Cell, *, for_good: bool, name: str = "") -> LifeMonitor:

@@ -18,7 +18,7 @@ from msgpack import ExtType
 from ..errors import DamagedValue, UnsavableValue, type_name
 from .forms import DATACLASS, ENUM, KNOWN, NAMED, SCALARS, STRUCT, flat
 from .renamed import former_members
-from .saved_refs import Kept
+from .saved_refs import SavedHandle
 
 Defaults = dict[str, tuple[tuple[str, ...], Callable[[], Any] | None]]
 """Members of a class that may be missing in what was saved: what they were called, and what gives their default."""
@@ -70,7 +70,7 @@ def class_mark(kind: Any) -> ExtType | None:
         return STRUCT
     if hasattr(kind, "_fields") and issubclass(kind, tuple):
         return NAMED
-    if issubclass(kind, Kept) or (dataclasses.is_dataclass(kind) and kind.__new__ is object.__new__):
+    if issubclass(kind, SavedHandle) or (dataclasses.is_dataclass(kind) and kind.__new__ is object.__new__):
         return DATACLASS
     return None
 

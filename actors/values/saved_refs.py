@@ -14,7 +14,7 @@ class Addressed:
         raise NotImplementedError
 
 
-class Kept:
+class SavedHandle:
     """What a state may hold and no message: it is saved as its attributes, in the form of a dataclass."""
 
     __slots__ = ()

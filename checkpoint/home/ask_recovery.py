@@ -578,10 +578,14 @@ class KeptMessage(NamedTuple):
 
 
 class Rejoin:
-    """All asks of a root that were under way when the one before it ended."""
+    """All asks of a root that were under way when the one before it ended.
 
-    def __init__(self, homes: Homes) -> None:
-        self._homes = homes
+    Attributes:
+        bears_repetition: whether a message to somebody who keeps no journal leads to the same if it is handled twice.
+    """
+
+    def __init__(self, homes: Homes, bears_repetition: Callable[[Codec, str, bytes], bool]) -> None:
+        self._homes, self.bears_repetition = homes, bears_repetition
         self._asks: dict[tuple[str, int, int, int], RejoinedAsk] = {}
         self._kept: dict[str, dict[str, KeptMessage]] = {}  # by address, and by who has told it in which output
 

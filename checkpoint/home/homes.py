@@ -11,7 +11,7 @@ from ...actors.events import RecordsMapped, RecoveryFailed
 from ...actors.kernel.cell import DOWN, GONE, Cell
 from ...actors.persistence import CHILDREN, ENTRIES, child_key
 from ..address_tree import AddressTree
-from ..addresses import Addresses, RegisteredKeys, is_of_actor, renamed
+from ..addresses import Addresses, is_of_actor, renamed
 from ..group_commit import Commits, Unkept
 from ..inputs import HomeJournal
 from ..journal import Saved, StoreEngine
@@ -63,7 +63,6 @@ class Homes:
         bears_repetition: Callable[[Codec, str, bytes], bool] = never_again,
     ) -> None:
         self.node = node
-        self.bears_repetition = bears_repetition
         self.journal = Commits(journal, node.loop, durability=durability or "os", emit=node.emit, where=f"/{node.name}")
         self._unkept = Unkept(self.journal)
         self.addresses = Addresses(node, journal, self.find)
@@ -80,9 +79,8 @@ class Homes:
         self._stored = set(filter(is_of_actor, journal.addresses()))
         self._known = AddressTree(self._stored)  # with those at which somebody was started since
         self._noted = AddressTree(key.removeprefix(CHILDREN) for key in journal.notes(CHILDREN))  # children
-        self._entries = RegisteredKeys(journal)
         self.groups = Groups(self)
-        self.rejoin = Rejoin(self)
+        self.rejoin = Rejoin(self, bears_repetition)
         self.far = FarMail(self)
         self.erasures = Erasures(self)
 
@@ -240,7 +238,7 @@ class Homes:
             if (now := renamed(names, above)) != above:
                 self.note(key, None)
                 self.note(child_key(now, name), value)
-        self._entries.rename(names)
+        self.addresses.registered.rename(names)
         self.quarantine.rename(paths)
 
     def vacate(self, path: str, why: str) -> None:
@@ -349,7 +347,7 @@ class Homes:
         if not self.addresses.is_lent(path):  # Else the store has there what was recorded of one that has moved away.
             self.journal.erase(path)  # First: if the store refuses, nothing is forgotten here either.
         self.addresses.erased(path)
-        self._entries.erase(path)
+        self.addresses.registered.erase(path)
         self._stored.discard(path)
         self._known.discard(path)
         self._blamed.discard(path)
@@ -412,7 +410,7 @@ class Homes:
             else:
                 self._noted.add(path)
         elif key.startswith(ENTRIES):
-            self._entries.noted(key, value)
+            self.addresses.registered.noted(key, value)
 
     def noted(self, key: str) -> bytes | None:
         """The fact of that name, or None."""

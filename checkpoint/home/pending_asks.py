@@ -233,7 +233,7 @@ class PendingCalls:
             answer = None if (turn, k) in self.sends else ACCEPTED
         elif answer is None and (turn, k) not in self.asks and not home.homes.rejoin.joins(home, turn, key, out):
             # The root itself was restarted meanwhile, and whoever was asked keeps no journal.
-            if turn > home.ledger.turn and home.homes.bears_repetition(home.node.codec, out.name, out.body):
+            if turn > home.ledger.turn and home.homes.rejoin.bears_repetition(home.node.codec, out.name, out.body):
                 home.outputs.ask_again(turn, key, out)
                 return
             why = "the program was started again since, and what it had in hand was not recorded"

@@ -144,7 +144,7 @@ class SnapshotState:
 
 
 @dataclasses.dataclass(slots=True)
-class TurnWaits:
+class LifeWaits:
     """What turns of a life wait for.
 
     Attributes:

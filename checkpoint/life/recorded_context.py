@@ -33,7 +33,7 @@ from ...actors.kernel.ref import ActorRef, current
 from ...actors.kernel.timers import Timer
 from ...actors.seconds import check_seconds
 from ...actors.values import encode_value
-from ...actors.values.saved_refs import Kept
+from ...actors.values.saved_refs import SavedHandle
 from ..protocol import REPLY, SINCE_THEN, Answer, EndWanted, Feed, Perform, Performed, PipeDone
 from ..turn_word import WAITS
 from .life_state import Asked
@@ -48,7 +48,7 @@ R = TypeVar("R")
 A = TypeVar("A", bound=Actor)
 
 
-class KeptHandle(Kept):
+class KeptHandle(SavedHandle):
     """A handle of a recorded actor, which may be kept in a key variable. Equal if it is on the same."""
 
     __slots__ = ("id",)

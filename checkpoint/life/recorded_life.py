@@ -73,7 +73,7 @@ from ..snapshot.image_writer import Imaging
 from ..snapshot.key_variables import check_keys, restore_state, save_state, variables
 from .determinism_guard import DeterminismGuard
 from .glances import answer_beside
-from .life_state import Asked, Awaited, LifeStage, LifeTimers, RestoredState, SnapshotState, TurnWaits
+from .life_state import Asked, Awaited, LifeStage, LifeTimers, LifeWaits, RestoredState, SnapshotState
 from .outcome_order import OutcomeOrder, is_given_up
 from .readonly_guard import check_readonly
 from .recorded_context import Pending, RecordedContext
@@ -118,7 +118,7 @@ class Life:
         self.feed: Feed | None = None
         self.outs: list[Out] = []
         self.last_k = 0
-        self.waits = TurnWaits(OutcomeOrder(self))
+        self.waits = LifeWaits(OutcomeOrder(self))
         self.pipes = 0
         self.stash: list[Fed] = []
         self.returned: dict[int, Fed] = {}

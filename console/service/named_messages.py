@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, get_origin
 
 import msgspec
 
@@ -52,9 +52,9 @@ def made_message(system: ActorSystem, ref: ActorRef[Any], name: str, fields: str
     kind = _class_named(ref, name)
 
     def as_ref(declared: Any, value: Any) -> Any:
-        if getattr(declared, "__origin__", declared) is ActorRef and isinstance(value, str):
+        if (get_origin(declared) or declared) is ActorRef and isinstance(value, str):
             return system.ref(value)
-        raise TypeError(f"no JSON becomes a {getattr(declared, '__name__', declared)}")
+        raise TypeError(f"no JSON becomes a {declared.__name__ if isinstance(declared, type) else declared}")
 
     try:
         given = msgspec.json.decode(fields)

@@ -58,7 +58,7 @@ class FirstLines:
     is_trying: bool = False
 
     def add(self, line: ProgramLine) -> None:
-        """Keep one more line."""
+        """Keep one more line, behind the others."""
         self.lines.append(line)
         self.characters += len(line.text)
 
@@ -68,7 +68,7 @@ class FirstLines:
             yield self.take()
 
     def take(self) -> ProgramLine:
-        """Take out the oldest."""
+        """Take out the line that was kept first."""
         line = self.lines.popleft()
         self.characters -= len(line.text)
         return line

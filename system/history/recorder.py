@@ -14,7 +14,7 @@ from ..last_lines.line_memory import LineMemory
 from .authors import author
 from .counted_work import COUNTED, count_work
 from .forgetting import telling_of
-from .intake.alike import EVERY, AlikeCounter
+from .intake.alike_events import EVERY, AlikeCounter
 from .lives import LivesByAddress
 from .past_event import UNKEPT, PastEvent, Plain, plain_fields, shortened
 from .tracks import BOUNDS, EventTrack, TrackName, track_of

@@ -17,7 +17,7 @@ MOST_RESTARTED = 1_000
 Tell = Callable[[str, list[Recovered]], None]
 
 
-class Recoveries:
+class LogRecoveries:
     """The recoveries that were not told of yet, by the address above them that was restarted, else by their parent's.
 
     Args:

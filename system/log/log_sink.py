@@ -88,7 +88,7 @@ from ..last_lines.line_memory import LineLevel, LineMemory
 from ..mechanism_notes import AdaptationUndone
 from ..specification import SpecificationNotKept
 from ..transaction.events import ScriptLoaded, TransactionCommitted, TransactionRolledBack
-from .log_recoveries import Recoveries
+from .log_recoveries import LogRecoveries
 
 BURST = 10
 """Records of one kind within a second; what is more is counted and told with the next one."""
@@ -141,7 +141,7 @@ class LogSink:
         self._lines = lines
         self._second: dict[type, tuple[int, int]] = {}
         self._crashes: dict[str, tuple[Event, asyncio.TimerHandle]] = {}  # by address: what waits for its supervisor
-        self._recoveries = Recoveries(loop, self._write_recovered)
+        self._recoveries = LogRecoveries(loop, self._write_recovered)
         self._letters: dict[tuple[str, type, str], tuple[float, int]] = {}  # when one was told, and how many not since
 
     def __call__(self, event: Event) -> None:

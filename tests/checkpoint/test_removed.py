@@ -37,14 +37,14 @@ CHECKS = {
     ),
     "who is erased holds nothing": Check(
         "checkpoint/home/homes.py",
-        "        self._entries.erase(path)\n",
+        "        self.addresses.registered.erase(path)\n",
         "",
         REGISTRY,
         "begins_with_nothing",
     ),
     "what an actor holds moves with it": Check(
         "checkpoint/home/homes.py",
-        "        self._entries.rename(names)\n",
+        "        self.addresses.registered.rename(names)\n",
         "",
         REGISTRY,
         "moves_with_it",
@@ -58,7 +58,7 @@ CHECKS = {
     ),
     "what bears repetition is asked again by the next program": Check(
         "checkpoint/home/pending_asks.py",
-        "if turn > home.ledger.turn and home.homes.bears_repetition(home.node.codec, out.name, out.body):",
+        "if turn > home.ledger.turn and home.homes.rejoin.bears_repetition(home.node.codec, out.name, out.body):",
         "if False:",
         ORDERS,
         "end and task",

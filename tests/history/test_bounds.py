@@ -15,7 +15,8 @@ from holdfast.actors.exit_reasons import SHUTDOWN, Crash, crash
 from holdfast.actors.kernel.codec import Parcel
 from holdfast.checkpoint.store_opening import open_journal
 from holdfast.system.history import recorder, tracks, writer
-from holdfast.system.history.intake import alike, quota
+from holdfast.system.history.intake import alike_events as alike
+from holdfast.system.history.intake import quota
 from holdfast.system.history.lives import LivesByAddress
 from holdfast.system.history.past_event import LONGEST, PastEvent, plain_fields
 from holdfast.system.history.raised import raised_at, traceback_text

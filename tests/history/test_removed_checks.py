@@ -45,7 +45,7 @@ CHECKS = {
         "test_a_storm_is_recorded_in_part_and_no_more_events_are_made",
     ),
     "what a mailbox drops by its policy is counted": Check(
-        "system/history/intake/alike.py",
+        "system/history/intake/alike_events.py",
         "EventQuota(1 if is_meant else FIRST, 1.0 / EVERY, now)",
         "EventQuota(FIRST, 1.0 / EVERY, now)",
         BOUNDS,
