@@ -1,10 +1,10 @@
 """Every folder of tests meets both event loops, and no test leaves anything behind.
 
-The tests of `actors/`, which is what touches the loop, run under both loops. Of any other async test each set of
-parameters runs under one of the two, in turn; `HOLDFAST_LOOPS=both` has all of them run under both. A test that must
-not run under one of the loops says so with `@pytest.mark.asyncio(loop_factories=["uvloop"])`, one that shall always run
-under both with `loop_factories=["uvloop", "asyncio"]`, and one that is about time, where nothing waits, with
-`loop_factories=["virtual"]` (`holdfast.testing.clock`). The loops are named in pyproject.toml (`holdfast_loops`) and
+The tests of the kernel (`tests/actors/*.py`), which is what touches the loop, run under both loops. Of any other async
+test each set of parameters runs under one of the two, in turn; `HOLDFAST_LOOPS=both` has all of them run under both. A
+test that must not run under one of the loops says so with `@pytest.mark.asyncio(loop_factories=["uvloop"])`, one that
+shall always run under both with `loop_factories=["uvloop", "asyncio"]`, and one that is about time, where nothing
+waits, with `loop_factories=["virtual"]` (`holdfast.testing.clock`). The loops are named in pyproject.toml (`holdfast_loops`) and
 made by our own plugin.
 
 Of a test that is marked with `pairs` some rows run, in which each pair of values of two parameters occurs; the loop
@@ -98,7 +98,7 @@ LONGEST = (
 """Files that take long for the tests they have, longest first: if one were begun last, it alone would be waited for."""
 
 LOOP = "_asyncio_loop_factory"  # the parameter that pytest-asyncio adds
-UNDER_BOTH = Path(__file__).parent / "actors"
+UNDER_BOTH = Path(__file__).parent / "actors"  # but not the folders in it
 
 # Inherited by every process that a test starts, so that orphans are found: they are nobody's children any more.
 MARK = "HOLDFAST_TEST_RUN"
@@ -217,7 +217,7 @@ class Places:
 
 def _chooses_loops(item: pytest.Item) -> bool:
     marker = item.get_closest_marker("asyncio")
-    return item.path.is_relative_to(UNDER_BOTH) or (marker is not None and "loop_factories" in marker.kwargs)
+    return item.path.parent == UNDER_BOTH or (marker is not None and "loop_factories" in marker.kwargs)
 
 
 @pytest.fixture(scope="session", autouse=True)

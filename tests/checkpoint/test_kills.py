@@ -22,7 +22,7 @@ import holdfast
 
 SCRIPT = Path(__file__).with_name("kill_player.py")
 PATHS = os.pathsep.join(filter(None, (str(Path(holdfast.__file__).parents[1]), os.environ.get("PYTHONPATH"))))
-KILLS = int(os.environ.get("HOLDFAST_KILLS", "24"))
+KILLS = int(os.environ.get("HOLDFAST_KILLS", "12"))
 SEED = int(os.environ.get("HOLDFAST_SEED", "20260901"))
 CALLERS = 8
 ROUND = 6

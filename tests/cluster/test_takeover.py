@@ -12,7 +12,7 @@ from holdfast.cluster.log_records import BASE, read_part
 from holdfast.testing.fleet.broker import BrokerFaults, SimBroker
 from tests.cluster.fleets import Fleet, simulate, small_sizes
 
-SEEDS = int(os.environ.get("HOLDFAST_FLEETS", "40"))
+SEEDS = int(os.environ.get("HOLDFAST_FLEETS", "24"))
 
 
 def weather(fleet: Fleet) -> None:

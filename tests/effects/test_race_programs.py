@@ -20,7 +20,7 @@ from holdfast.testing import GuardedSystem, Simulation, simulate
 from tests.effects.race_player import WORLD, Helper, Play, Player, Ring, Told
 
 FIRST = int(os.environ.get("HOLDFAST_SEED", "1"))
-RACES = int(os.environ.get("HOLDFAST_RACES", "8"))
+RACES = int(os.environ.get("HOLDFAST_RACES", "5"))
 SEEDS = range(FIRST, FIRST + RACES)
 NUMBERS = 6
 STRIKES = 8

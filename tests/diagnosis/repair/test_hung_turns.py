@@ -77,8 +77,9 @@ class Listener(hf.Actor):
 
 
 @pytest.mark.asyncio(loop_factories=["uvloop"])
-@pytest.mark.parametrize(("isolation", "bad"), [("task", Hang()), ("process", Spin())], ids=str)
-@pytest.mark.parametrize("by", ["send", "ask"])
+@pytest.mark.parametrize(
+    ("isolation", "bad", "by"), [("task", Hang(), "send"), ("task", Hang(), "ask"), ("process", Spin(), "ask")], ids=str
+)
 async def test_an_actor_whose_turn_hangs_again_is_healed_by_repair(isolation: Any, bad: hf.Message, by: str) -> None:
     spec = hf.child("node", hf.start(Node), isolation=isolation, recovery=hf.hybrid(), shutdown=0.2)
     async with hf.ActorSystem("t", log=False) as system:
