@@ -4,8 +4,8 @@ The tests of the kernel (`tests/actors/*.py`), which is what touches the loop, r
 test each set of parameters runs under one of the two, in turn; `HOLDFAST_LOOPS=both` has all of them run under both. A
 test that must not run under one of the loops says so with `@pytest.mark.asyncio(loop_factories=["uvloop"])`, one that
 shall always run under both with `loop_factories=["uvloop", "asyncio"]`, and one that is about time, where nothing
-waits, with `loop_factories=["virtual"]` (`holdfast.testing.clock`). The loops are named in pyproject.toml (`holdfast_loops`) and
-made by our own plugin.
+waits, with `loop_factories=["virtual"]` (`holdfast.testing.clock`). The loops are named in pyproject.toml
+(`holdfast_loops`) and made by our own plugin.
 
 Of a test that is marked with `pairs` some rows run, in which each pair of values of two parameters occurs; the loop
 is one of these parameters where a test runs under both. `HOLDFAST_CROSSED=1` runs all.
