@@ -192,6 +192,13 @@ CHECKS = {
         PBR,
         "test_who_is_alone_again",
     ),
+    "a turn that rests does not hold up the stop of a protected actor": Check(
+        "ftm/group/group_place.py",
+        "                await leave_resting(group)\n",
+        "",
+        "tests/effects/test_waits_under_mechanisms.py",
+        "test_who_rests_is_stopped_at_once and tmr",
+    ),
     "a group has its second replica back within a second": Check(
         "ftm/group/group_place.py",
         "Backoff(initial=0.01, maximum=0.8, reset_after=1.0)",
