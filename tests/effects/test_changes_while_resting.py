@@ -109,12 +109,13 @@ async def test_whole_seconds_are_the_same_behind_a_change(tmp_path: Path, isolat
 async def test_a_snapshot_that_is_due_keeps_no_change_waiting(tmp_path: Path, isolation: Any, change: str) -> None:
     """It is to be taken before anything else, and after the turn that waits: it lapses with that."""
     async with running(tmp_path, "os") as system:
-        ref = await system.start(patient(isolation, recovery=hf.hybrid(interval=0.02)))
+        ref = await system.start(patient(isolation, recovery=hf.hybrid(interval=1000)))
         assert await ref.ask(Count(), IN_TIME) == 1
         asked = ref.ask(Go(["c"]), IN_TIME)
         await waits(system)
         home = switch_of(ref._cell)
         assert home is not None
+        home.due.want()
         async with asyncio.timeout(IN_TIME):
             while home.due.asked_at < 0:
                 await asyncio.sleep(0.001)
