@@ -27,6 +27,8 @@ VARIES = [
 """What is another one each time: moments and numbers of events, seconds, sizes, processes, lines of the programs."""
 CHANGES = re.compile(r"(holdfast (restart|quarantine (drop|retry))|kill|dd|rm) ")
 """Commands that change something; the others are given again until they say what is shown."""
+REFUSED = re.compile(r"^\[exit \d+\]$", re.M)
+"""It changed nothing: somebody to kill, say, has no process yet, for the program has only begun."""
 PATIENCE = 30.0
 
 
@@ -79,12 +81,13 @@ async def said(before: list[str], line: str, folder: Path) -> str:
 
 
 async def follows(before: list[str], line: str, shown: str, folder: Path) -> None:
-    """A command says what is shown: at once if it changes something, else before long."""
+    """A command says what is shown: at once if it has changed something, else before long."""
     output = ""
     try:
         async with asyncio.timeout(PATIENCE):
             while not is_shown(masked(shown), masked(output := await said(before, line, folder))):
-                assert CHANGES.match(line) is None, f"$ {line}\n{output}"
+                has_changed = CHANGES.match(line) is not None and not REFUSED.search(output)
+                assert not has_changed, f"$ {line}\n{output}"
     except TimeoutError:
         raise AssertionError(f"$ {line}\n{output}\nis shown as\n{shown}") from None
 
