@@ -568,6 +568,7 @@ class KeptMessage(NamedTuple):
         sender: the address that has told it.
         positions: where in the journal it stands.
         is_earlier: whether a program before this one has kept it.
+        ask: whose outcome is due for it, if that is known here already.
     """
 
     name: str
@@ -575,6 +576,7 @@ class KeptMessage(NamedTuple):
     sender: str
     positions: list[int]
     is_earlier: bool = False
+    ask: SwitchAsk | None = None
 
 
 class Rejoin:
@@ -589,12 +591,17 @@ class Rejoin:
         self._asks: dict[tuple[str, int, int, int], RejoinedAsk] = {}
         self._kept: dict[str, dict[str, KeptMessage]] = {}  # by address, and by who has told it in which output
 
-    def keep(self, home: Switch, origin: str, out: Out, sender: str, batch: Batch) -> bool:
-        """Keep what a turn of `home` tells to who was not started by this program yet; False if somebody was."""
+    def keep(
+        self, home: Switch, origin: str, out: Out, sender: str, batch: Batch, ask: SwitchAsk | None = None
+    ) -> bool:
+        """Keep what a turn of `home` tells to who was not started by this program yet; False if somebody was.
+
+        An ask that it hands on is kept with what is to be said to who asks.
+        """
         to = self._homes.addresses.now(out.to)  # A ref may know it by an address that it has left.
         if not self._homes.is_unopened(to):
             return False
-        kept = self.kept_for(to)[origin] = KeptMessage(out.name, out.body, sender, [])
+        kept = self.kept_for(to)[origin] = KeptMessage(out.name, out.body, sender, [], ask=ask)
         shape = home.shapes.now(out.name) if home.journal.durable else None
         if shape is not None:  # Its journal may have the table of an older program.
             batch.add(to, shape_entry(out.name, shape), [])
@@ -623,7 +630,7 @@ class Rejoin:
             if (kept.sender, own) not in known:
                 source = home.record(MESSAGE, kept.name, kept.body, kept.sender, origin=own)
                 if is_ask:
-                    self._owed(home, source)
+                    self._owed(home, source, kept.ask)
                 home.forward(source)
 
     def loaded(self, home: Switch) -> None:
@@ -637,9 +644,9 @@ class Rejoin:
         self._hand_over(home)
         self._homes.far.opened(home.path)
 
-    def _owed(self, home: Switch, source: Input) -> None:
+    def _owed(self, home: Switch, source: Input, ask: SwitchAsk | None = None) -> None:
         assert source.sender is not None
-        ask = self._of(source.sender, *_numbers(source.origin))
+        ask = ask or self._of(source.sender, *_numbers(source.origin))
         if not ask.is_over:
             source.ask, source.chain = ask, ask.chain
             ask.to, ask.started = home.cell, True

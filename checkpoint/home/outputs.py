@@ -18,7 +18,7 @@ from ..inputs import Batch
 from ..life.recorded_inbox import STARTED
 from ..protocol import MESSAGE, PIPE, Answer, Hooked, Out, PipeDone
 from .admission import TurnRows
-from .ask_recovery import origin_asked, origin_kept
+from .ask_recovery import origin_asked, origin_asked_by, origin_kept
 from .held_messages import Inlet, inlet, is_unread
 from .pending_asks import SwitchAsk, answer_ask, origin_of
 from .present_life import LifePort
@@ -195,8 +195,7 @@ class Outputs:
         if far.lasts(out.to):
             far.keep(origin_kept(home, turn, out), out, sender, batch)
             return True
-        is_there = not target.is_dead and not is_unread(target)
-        return not is_there and home.homes.rejoin.keep(home, origin_kept(home, turn, out), out, sender, batch)
+        return is_away(target) and home.homes.rejoin.keep(home, origin_kept(home, turn, out), out, sender, batch)
 
     def _publish(self, turn: int, out: Out, batch: Batch) -> None:
         """A message to each subscriber, when it has room; the publisher waits until the last one has accepted it."""
@@ -304,7 +303,7 @@ class Outputs:
     def _ask(self, turn: int, key: int, out: Out, batch: Batch) -> None:
         home = self._home
         target, source = home.node.cell_at(out.to), home.ledger.open.get(key)
-        if (target.is_dead or is_unread(target)) and switch_of(target) is None:
+        if is_away(target) and switch_of(target) is None:
             origin = origin_asked(home, turn, out, source)
             if home.homes.rejoin.keep(home, origin, out, home.path, batch):
                 # It is as if it had been asked before this program began.
@@ -380,6 +379,10 @@ class Outputs:
             ask.chain = with_tail(ask.chain, out.trace)
             follow(ask)
         switch, sender = switch_of(target), None if ask.sender is None else ask.sender.path
+        if switch is None and is_away(target) and isinstance(ask, SwitchAsk):
+            # It is as if its receiver had had it before this program began.
+            if home.homes.rejoin.keep(home, origin_asked_by(ask), out, ask.asker, batch, ask):
+                return
         if switch is not None and not switch.waits(ask) and switch.takes_now(ask, out, sender):
             self._record_ask(switch, ask, out, sender, batch)
             if switch.intake.between is not None and isinstance(ask, SwitchAsk):
@@ -411,6 +414,11 @@ class Outputs:
             home.topics.pop(out.to, None)
             if home.cell is not None:
                 home.node.topics.unsubscribe(out.to, inlet(home, out.to))
+
+
+def is_away(target: Cell) -> bool:
+    """Whether nobody has lived at an address since this program began."""
+    return target.is_dead or is_unread(target)
 
 
 def trace_of(out: Out) -> Chain:

@@ -119,6 +119,13 @@ CHECKS = {
         "tests/checkpoint/test_forwarded.py",
         "handed_on_is_not_lost and ask-unbounded",
     ),
+    "an ask is handed on to somebody who is not started yet": Check(
+        "checkpoint/home/outputs.py",
+        "if switch is None and is_away(target) and isinstance(ask, SwitchAsk):",
+        "if False:",
+        "tests/checkpoint/test_forwarded.py",
+        "not_started_yet",
+    ),
     "who is started anew tells other things than before": Check(
         "checkpoint/home/ask_recovery.py",
         'return f"kept {home.path}|{turn}.{out.k} {home.node.numbers.next_seed():x}"',
