@@ -379,10 +379,13 @@ class Outputs:
             ask.chain = with_tail(ask.chain, out.trace)
             follow(ask)
         switch, sender = switch_of(target), None if ask.sender is None else ask.sender.path
-        if switch is None and is_away(target) and isinstance(ask, SwitchAsk):
-            # It is as if its receiver had had it before this program began.
-            if home.homes.rejoin.keep(home, origin_asked_by(ask), out, ask.asker, batch, ask):
-                return
+        if (
+            switch is None
+            and is_away(target)
+            and isinstance(ask, SwitchAsk)
+            and home.homes.rejoin.keep(home, origin_asked_by(ask), out, ask.asker, batch, ask)
+        ):
+            return  # It is as if its receiver had had it before this program began.
         if switch is not None and not switch.waits(ask) and switch.takes_now(ask, out, sender):
             self._record_ask(switch, ask, out, sender, batch)
             if switch.intake.between is not None and isinstance(ask, SwitchAsk):

@@ -121,8 +121,8 @@ CHECKS = {
     ),
     "an ask is handed on to somebody who is not started yet": Check(
         "checkpoint/home/outputs.py",
-        "if switch is None and is_away(target) and isinstance(ask, SwitchAsk):",
-        "if False:",
+        "and is_away(target)\n",
+        "and False\n",
         "tests/checkpoint/test_forwarded.py",
         "not_started_yet",
     ),
