@@ -590,7 +590,7 @@ CHECKS = {
     ),
     "who has asked somebody who was not started is answered": Check(
         "checkpoint/home/ask_recovery.py",
-        "                    self._owed(home, source)\n                home.forward",
+        "                    self._owed(home, source, kept.ask)\n                home.forward",
         "                    pass\n                home.forward",
         "tests/effects/test_long_waits.py",
         "test_what_is_asked_of_somebody",
