@@ -48,6 +48,33 @@ class Sink(hf.Actor):
         return list(self.notes)
 
 
+class Pass(hf.Message): ...
+
+
+class Let(hf.Message): ...
+
+
+class Barrier(hf.Actor):
+    """Answers nobody until it is told to let them through."""
+
+    def __init__(self) -> None:
+        self.waiting: list[hf.ReplyHandle[None]] = []
+        self.lets = False
+
+    @hf.on(Pass)
+    def come(self, message: Pass) -> hf.ReplyHandle[None] | None:
+        if self.lets:
+            return None
+        self.waiting.append(self.ctx.reply_handle())
+        return self.waiting[-1]
+
+    @hf.on(Let)
+    def let(self, message: Let) -> None:
+        self.lets = True
+        for one in self.waiting:
+            one.reply(None)
+
+
 class Do(hf.Message[str]):
     """Steps such as "add 1"; what is sent goes to `peer`."""
 

@@ -11,7 +11,7 @@ import pytest
 
 import holdfast as hf
 from tests.checkpoint.conftest import ROOT
-from tests.checkpoint.players import start, until
+from tests.checkpoint.players import Barrier, Let, Pass, start, until
 from tests.checkpoint.strikes import NEVER, strike
 
 SHORT = 0.2
@@ -21,12 +21,6 @@ METHODS: dict[str, Any] = {
     "replay_only": hf.replay_only(),
     "checkpoint_only": hf.checkpoint_only(NEVER),
 }
-
-
-class Pass(hf.Message): ...
-
-
-class Let(hf.Message): ...
 
 
 class Book(hf.Message):
@@ -44,27 +38,6 @@ class Open(hf.Message):
 
 
 class Booked(hf.Message[list[str]]): ...
-
-
-class Barrier(hf.Actor):
-    """Answers nobody until it is told to let them through."""
-
-    def __init__(self) -> None:
-        self.waiting: list[hf.ReplyHandle[None]] = []
-        self.lets = False
-
-    @hf.on(Pass)
-    def come(self, message: Pass) -> hf.ReplyHandle[None] | None:
-        if self.lets:
-            return None
-        self.waiting.append(self.ctx.reply_handle())
-        return self.waiting[-1]
-
-    @hf.on(Let)
-    def let(self, message: Let) -> None:
-        self.lets = True
-        for one in self.waiting:
-            one.reply(None)
 
 
 class Hotel(hf.Actor):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import importlib.util
+import os
 import re
 import subprocess
 import sys
@@ -14,40 +15,15 @@ from typing import Any
 import pytest
 
 import holdfast as hf
+from tests.checkpoint.players import Barrier, Let
 
 PAGE = Path(__file__).parents[2] / "docs" / "pools.md"
-BORROWERS = '''
+BORROWERS = """
+from tests.checkpoint.players import Barrier, Let, Pass
 
 class Go(hf.Message[str]):
     patience: float
     gives_back: int = 1
-
-
-class Let(hf.Message): ...
-
-
-class Pass(hf.Message): ...
-
-
-class Barrier(hf.Actor):
-    """Who works with a worker waits here."""
-
-    def __init__(self) -> None:
-        self.waiting: list[hf.ReplyHandle[None]] = []
-        self.lets = False
-
-    @hf.on(Pass)
-    def come(self, message: Pass) -> hf.ReplyHandle[None] | None:
-        if self.lets:
-            return None
-        self.waiting.append(self.ctx.reply_handle())
-        return self.waiting[-1]
-
-    @hf.on(Let)
-    def let(self, message: Let) -> None:
-        self.lets = True
-        for one in self.waiting:
-            one.reply(None)
 
 
 class Borrower(hf.Actor):
@@ -65,7 +41,7 @@ class Borrower(hf.Actor):
         finally:
             for _ in range(message.gives_back):
                 self.lender.tell(GiveBack(loan))
-'''
+"""
 PROGRAM = """
 
 import os, sys
@@ -125,7 +101,7 @@ class House:
 
     async def open(self, recovery: Any = None) -> None:
         page, start = self.page, self.system.start
-        self.barrier = await start(hf.child("barrier", hf.start(page.Barrier)))
+        self.barrier = await start(hf.child("barrier", hf.start(Barrier)))
         lent = hf.hybrid(durability="memory")
         self.lender = await start(hf.child("lender", hf.start(page.Lender, ["w"]), recovery=lent))
         self.borrowers = [
@@ -149,7 +125,7 @@ class House:
         assert await self.borrowers[1].ask(self.page.Go(60.0), timeout=60.0) == "w"
 
     async def is_back_once(self) -> None:
-        await self.barrier.ask(self.page.Let())
+        await self.barrier.ask(Let())
         await self.somebody_gets_it()
         state = await self.system.get_state(self.lender, timeout=60.0)
         assert (state["free"], state["lent"]) == (["w"], {})
@@ -169,7 +145,7 @@ async def test_the_lender_may_die_while_a_worker_is_lent(house: House, *, is_sav
         await house.system.checkpoint(house.lender, timeout=60.0)
     house.lender.kill()
     await house.nobody_else_gets_it()
-    await house.barrier.ask(house.page.Let())
+    await house.barrier.ask(Let())
     assert await going == "w"
     await house.is_back_once()
 
@@ -177,7 +153,7 @@ async def test_the_lender_may_die_while_a_worker_is_lent(house: House, *, is_sav
 async def test_a_loan_that_is_given_back_twice_is_one_worker(house: House) -> None:
     await house.open()
     going = await house.first_has_it(gives_back=2)
-    await house.barrier.ask(house.page.Let())
+    await house.barrier.ask(Let())
     await going
     await house.is_back_once()
 
@@ -196,7 +172,7 @@ async def test_a_recorded_borrower_that_is_killed_goes_on_with_its_worker(house:
     going = await house.first_has_it()
     house.borrowers[0].kill()
     await house.nobody_else_gets_it()
-    await house.barrier.ask(house.page.Let())
+    await house.barrier.ask(Let())
     assert await going == "w"
     await house.is_back_once()
 
@@ -205,7 +181,7 @@ async def test_who_has_given_up_is_lent_nothing(house: House) -> None:
     await house.open()
     going = await house.first_has_it()
     await house.nobody_else_gets_it()
-    await house.barrier.ask(house.page.Let())
+    await house.barrier.ask(Let())
     await going
     await house.is_back_once()
 
@@ -215,5 +191,6 @@ def test_recorded_borrowers_go_on_in_the_next_program_and_nobody_has_their_worke
     program.write_text(block() + PROGRAM)
     for run, code, out in (("first", -9, ""), ("next", 0, "['w']\n")):
         command = [sys.executable, str(program), f"sqlite:{tmp_path / 'app.db'}", run]
-        done = subprocess.run(command, capture_output=True, text=True)
+        environment = {**os.environ, "PYTHONPATH": str(PAGE.parents[1])}
+        done = subprocess.run(command, capture_output=True, text=True, env=environment)
         assert (done.returncode, done.stdout) == (code, out), done.stderr
