@@ -383,7 +383,7 @@ class Life:
                 self.handle_returned()
 
     def stop(self, reason: ExitReason) -> None:
-        """End in good order: behind the turn in hand, or in the middle of one that rests, now or later, perhaps for days.
+        """End in good order: behind the turn in hand, or in the middle of one that rests, also if it does so only then.
 
         So it is in one that waits for an answer of somebody who has been stopped before. The next life goes on with
         that. There is no snapshot of such a moment, and `on_stop` is not called in it.
@@ -399,7 +399,7 @@ class Life:
         self.leave_waiting()
 
     def leave_waiting(self) -> None:
-        """End in the middle of the turn in hand, if the life is to end and the turn rests, or waits for who has ended."""
+        """End in the middle of the turn in hand, if the life is to end, and that rests or waits for who has ended."""
         reason, turn = self.stage.stopping, None if self.cell.more is None else self.cell.more.turn
         if reason is None or turn is None or turn.then is not None or turn.killed or self.feed is None:
             return
