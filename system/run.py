@@ -106,8 +106,8 @@ def run(
     ends at once, as by SIGKILL but with the code of the signal. Code in C that never returns is the exception: Python
     does not learn of the signal then.
 
-    Tasks that are left when the program has returned are cancelled. Whichever has not ended ten seconds later is written
-    to stderr with its stack, and the program ends without it.
+    Tasks that are left when the program has returned are cancelled. Whichever has not ended ten seconds later is told
+    on stderr with its stack, and the program ends without it.
 
     Where there is no uvloop it is run on asyncio's own loop. Where loops handle no signals, which is on Windows, SIGINT
     cancels it, too, and SIGTERM ends the process at once.
