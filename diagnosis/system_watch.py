@@ -147,8 +147,8 @@ async def watch(
             `ok(ledger.growth)` is added to the model. A pattern such as `"desk/*"` stands for all components that it
             fits and that have no limits by name; of a generated model those that come later, too. Limits go with an
             actor that is moved.
-        expect: what else holds while components work, such as `Expectation("ok(pressure)", ("pump",))` for an observer of
-            your own. A generated model has it whenever it has all of these components.
+        expect: what else holds while components work, such as `Expectation("ok(disk)", ("ledger",))` for an observer
+            of your own. A generated model has it whenever it has all of these components.
         repair: "advise" says what it would do, and keeps the score of whether that would have been right. "ask" has a
             person approve each plan: by `approve`, or by `holdfast repair approve CASE`. "on" repairs: by `actions`
             and, for actors that are supervised, by a restart of the actor; what is dangerous, such as a restart of the
