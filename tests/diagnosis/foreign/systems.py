@@ -17,7 +17,7 @@ class Faults:
     """What is wrong with whom, by the last part of the address.
 
     freeze   a turn waits for ever                pause    one turn in ten waits for five seconds
-    away     so does an effect of it, as it says  age      each turn takes a tenth of a second more than the last
+    away     so does an effect of it, as it says  age      each turn takes 0.3 s more than the last
     slow     a turn takes too long for askers     stumble  one turn in three does
     lag      a turn takes half a second           storm    it gives itself more to do than it can
     crash    each turn raises                     falter   one turn in three does
@@ -76,7 +76,7 @@ class Faults:
                 await asyncio.sleep(0.5)
             case "age":
                 self.aged[name, id(actor)] += 1
-                await asyncio.sleep(0.1 * self.aged[name, id(actor)])
+                await asyncio.sleep(0.3 * self.aged[name, id(actor)])
             case "storm":
                 actor.ctx.ref.tell(Retry())
             case "crash" | "unborn" | "unbegun":
@@ -324,10 +324,10 @@ def _matching(faults: Faults) -> list[hf.ChildSpec]:
 ANY = "freeze crash falter pause end unended unborn unbegun stash storm"
 """What can be wrong with everybody."""
 SERVICE = f"{ANY} slow stumble age away owe refuse circle"
-SOURCE = f"{ANY} mute deaf away"
-DEVICE = f"{SOURCE} untimed"
+SOURCE = f"{ANY} mute deaf"
+DEVICE = f"{SOURCE} away untimed"
 STAGE = f"{SOURCE} stumble age"
-HEARER = f"{STAGE} unheard volley"
+HEARER = f"{STAGE} away unheard volley"
 LAST = f"{ANY} lag age"
 
 
