@@ -1,4 +1,4 @@
-"""Whose refusals let others down: one who only refuses any more, so that turns of those who ask come to nothing."""
+"""Whose refusals make the turns of others come to nothing."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ from collections import defaultdict
 from collections.abc import Collection
 from typing import NamedTuple
 
-from ...actors.errors import type_name
-from ...actors.events import ActorCrashed, DeadLetter
-from ...actors.exit_reasons import Crash
+from ...actors.events import DeadLetter
 from ...actors.kernel.message import Refusal
+from ...supervision.intensity import recent_restarts
 
 
 class _Refused(NamedTuple):
@@ -21,31 +20,25 @@ class _Refused(NamedTuple):
     when: float
 
 
-class _Ended(NamedTuple):
-    """A turn has ended by a refusal: whose, when, and whether it was a crash."""
-
-    whose: str
-    when: float
-    is_crash: bool
-
-
 @dataclasses.dataclass(frozen=True)
 class Refusals:
-    """Keeps who was refused what, and which turns have ended by it.
+    """Keeps who was refused what, and which turns have come to nothing by it.
 
-    A refusal is an answer, and no fault. But where one who used to answer only refuses any more, and turns of those who
-    ask end by it, it is that one, and not they. As soon as it answers otherwise, their crashes are their own. A refusal
-    that an actor passes on is that of whom it had asked.
+    A refusal is an answer, and no fault. But where one who used to answer otherwise only refuses any more, and turns of
+    those who were told something come to nothing by it, it is at fault, and not they. A refusal that an actor passes on
+    is that of whom it had asked.
 
     Args:
-        recent: seconds for which a turn may end by a refusal.
-        within: seconds for which the end of a turn counts.
+        recent: seconds after a refusal in which it may end a turn.
+        within: seconds for which such an end counts.
     """
 
     recent: float
     within: float
     last: dict[str, _Refused] = dataclasses.field(default_factory=dict[str, _Refused])
-    ended: defaultdict[str, list[_Ended]] = dataclasses.field(default_factory=lambda: defaultdict(list))
+    """The newest refusal that each actor got."""
+    ended: defaultdict[str, tuple[float, ...]] = dataclasses.field(default_factory=lambda: defaultdict(tuple))
+    """When turns have come to nothing by refusals of each, since it has answered otherwise."""
     answering: set[str] = dataclasses.field(default_factory=set[str])
     """Who was seen to answer otherwise."""
 
@@ -57,30 +50,22 @@ class Refusals:
         if asker is not None:
             self.last[asker] = _Refused(error, by, now)
 
-    def take_end(self, whose: str, event: ActorCrashed | DeadLetter, now: float) -> bool:
-        """A turn has ended in an error. Returns whether that is laid to one who has refused."""
+    def take_end(self, whose: str, letter: DeadLetter, now: float) -> None:
+        """Nobody handles a message that one was told: perhaps because its turn was refused what it needed."""
         refused = self.last.get(whose)
-        if refused is None or now - refused.when > self.recent or refused.by not in self.answering:
-            return False
-        is_crash = isinstance(event, ActorCrashed)
-        if is_crash:
-            is_its_end = isinstance(event.reason, Crash) and event.reason.type_name == type_name(type(refused.error))
-        else:
-            is_its_end = event.why == f"refused: {refused.error}"
-        if is_its_end:
-            self.ended[refused.by].append(_Ended(whose, now, is_crash))
-        return is_its_end
+        if refused is not None and now - refused.when <= self.recent and letter.why == f"refused: {refused.error}":
+            self.ended[refused.by] = (*self.ended[refused.by], now)
 
-    def answers(self, component: str) -> list[tuple[str, float]]:
-        """It has answered otherwise. Returns whose crashes were laid to it since, and are their own, and when."""
+    def answers(self, component: str) -> None:
+        """It has answered otherwise."""
         self.answering.add(component)
-        return [(one.whose, one.when) for one in self.ended.pop(component, ()) if one.is_crash]
+        self.ended.pop(component, None)
 
-    def ended_by(self, component: str, now: float) -> int:
-        """How many turns of others have ended by its refusals of late."""
-        if component not in self.ended:
+    def count(self, component: str, now: float) -> int:
+        """Turns of others that came to nothing by its refusals of late; none if it was never seen to do otherwise."""
+        if component not in self.ended or component not in self.answering:
             return 0
-        self.ended[component] = [one for one in self.ended[component] if now - one.when <= self.within]
+        self.ended[component] = recent_restarts(self.ended[component], now, self.within)
         return len(self.ended[component])
 
     def forget(self, names: Collection[str]) -> None:

@@ -283,16 +283,16 @@ class RuntimeObserver(Observer):
                 self._let_down[asker] = self.now
 
     def _take_ends(self, names: Mapping[str, str]) -> None:
-        """Ends by themselves; who could not bear that another one did not answer, or refused, is not to blame."""
+        """Ends by themselves; who could not bear that another one did not answer is not to blame."""
         assert self._stream is not None
         for event in self._stream.take():
             component = names.get(event.address)
-            if component is not None and isinstance(event, ActorCrashed | DeadLetter):
-                if self._refusals.take_end(component, event, self.now):
-                    continue
             match event:
                 case ActorCrashed(reason=Crash() as reason) | ChildTerminated(reason=Normal() as reason):
                     pass
+                case DeadLetter() if component is not None:
+                    self._refusals.take_end(component, event, self.now)
+                    continue
                 case _:
                     continue
             was_let_down = self.now - self._let_down.get(component or "", -math.inf) <= 2 * self.manner.every
@@ -318,8 +318,7 @@ class RuntimeObserver(Observer):
         has_moved = has_got_on or work.own_turns != seen.own_turns
         seen.own_turns, seen.moved = work.own_turns, now if has_moved else seen.moved
         if has_got_on and work.has_answered and seen.refused < now:  # It has refused nothing since the last look.
-            for asker, when in self._refusals.answers(component):
-                self._seen(asker).crashes = tuple(sorted((*self._seen(asker).crashes, when)))
+            self._refusals.answers(component)
         waits_now = sorted(waits.get(component, ()))
         seen.waited.append(waits_now[0] if waits_now else "")
         usual = max(self._patience, LONGER * seen.longest)
@@ -409,7 +408,7 @@ class RuntimeObserver(Observer):
         seen, now, keeps = self._known[component], self.now, self.manner.time_to_live
         was = None if now - max(seen.since, seen.moved) > keeps else self._kept(progress(component))
         self.verdict(progress(component), True if of_it.has_got_on else was)
-        if self._refusals.ended_by(component, now) >= LOOP:
+        if self._refusals.count(component, now) >= LOOP:
             self._deny(replies(component))
             return
         has_refused = now - seen.refused <= keeps
