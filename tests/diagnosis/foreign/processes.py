@@ -97,7 +97,9 @@ async def strike(who: str, kind: str, seed: int) -> ProcessTrial:
     """Let the system run, and strike one of its processes."""
     said: list[tuple[float, Any]] = []
     loop, rng = asyncio.get_running_loop(), random.Random(seed)
-    children: list[hf.ChildSpec] = [hf.child(name, hf.start(alone), isolation="process") for name, alone in ALONE.items()]
+    children: list[hf.ChildSpec] = [
+        hf.child(name, hf.start(alone), isolation="process") for name, alone in ALONE.items()
+    ]
     children += [hf.child("asker", hf.start(Asker)), hf.child("sink", hf.start(Sink))]
     async with hf.ActorSystem("app", log=False, seed=seed) as system:
         await system.start(hf.supervisor("all", children=children, intensity=1000, period=5.0))
