@@ -323,7 +323,7 @@ CHECKS = {
         "            self._late += max(0.0, self._loop.time() - self._due)\n",
         "",
         SILENT,
-        "loop_itself_was_late and uvloop",
+        "loop_itself_was_late",
     ),
     "who asks first behind that knows it, too": Check(
         "diagnosis/own_time.py",
