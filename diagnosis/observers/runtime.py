@@ -71,6 +71,8 @@ class _Seen:
     """When asks of it have failed, and when they were made."""
     refused: float = -math.inf
     """When it has refused what it was asked for the last time."""
+    no: Ask | None = None
+    """The ask that it has refused then."""
     crashes: tuple[float, ...] = ()
     backlog: Backlog = dataclasses.field(default_factory=Backlog)
     waited: deque[str] = dataclasses.field(default_factory=lambda: deque(maxlen=USUAL))
@@ -146,7 +148,7 @@ class RuntimeObserver(Observer):
         self._rests_until = 0.0
         self._loops: set[str] = set()  # who ends again and again
         self._let_down: dict[str, float] = {}  # when an ask of theirs has failed
-        self._refusals = Refusals(2 * self.manner.every, WITHIN)
+        self._refusals = Refusals(2 * self.manner.every)
         self._waiting: set[Literal] = set()
 
     def on_start(self, restored: bool) -> None:
@@ -273,7 +275,7 @@ class RuntimeObserver(Observer):
             # That is an answer, and says nothing of whether it could have given another.
             if isinstance(error, Refusal):
                 if callee is not None:
-                    self._seen(callee).refused = self.now
+                    self._seen(callee).refused, self._seen(callee).no = self.now, ask
                     self._refusals.take(asker, callee, error, self.now)
                 continue
             if callee is not None and isinstance(error, AskTimeout):
@@ -317,7 +319,7 @@ class RuntimeObserver(Observer):
         has_got_on = seen.take(work, cell.life, now, self._patience)
         has_moved = has_got_on or work.own_turns != seen.own_turns
         seen.own_turns, seen.moved = work.own_turns, now if has_moved else seen.moved
-        if has_got_on and work.has_answered and seen.refused < now:  # It has refused nothing since the last look.
+        if has_got_on and work.has_answered and work.newest is not seen.no:
             self._refusals.answers(component)
         waits_now = sorted(waits.get(component, ()))
         seen.waited.append(waits_now[0] if waits_now else "")
@@ -408,7 +410,7 @@ class RuntimeObserver(Observer):
         seen, now, keeps = self._known[component], self.now, self.manner.time_to_live
         was = None if now - max(seen.since, seen.moved) > keeps else self._kept(progress(component))
         self.verdict(progress(component), True if of_it.has_got_on else was)
-        if self._refusals.count(component, now) >= LOOP:
+        if self._refusals.lets_down(component, now):
             self._deny(replies(component))
             return
         has_refused = now - seen.refused <= keeps

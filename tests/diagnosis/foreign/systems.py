@@ -2,6 +2,7 @@
 
 import asyncio
 import dataclasses
+import random
 from collections import Counter
 from collections.abc import Callable
 from typing import Any
@@ -37,8 +38,15 @@ class Faults:
     """Turns of those who age, by name and life."""
     is_of_a_life: bool = False
     """Whether nothing is wrong any more with a later life."""
+    refusals: float = 0.0
+    """The part of what they are asked that services refuse, which is no fault."""
+    rng: random.Random = dataclasses.field(default_factory=lambda: random.Random(1))
     came_out: Callable[[str], None] = lambda name: None
     """Called with the name of each who takes what the system makes, whenever it has taken something."""
+
+    def declines(self) -> bool:
+        """Whether a service refuses what it is asked, as it may."""
+        return self.refusals > 0 and self.rng.random() < self.refusals
 
     async def begin(self, actor: hf.Actor) -> None:
         """Let happen what is wrong with the start of an actor."""
@@ -217,10 +225,10 @@ class Service(Part):
 
     @hf.on(Wanted)
     async def answer(self, message: Wanted) -> "int | hf.ReplyHandle[int]":
-        match await self._faults.strike(self):
+        match await self._faults.strike(self) or self._faults.declines():
             case "owe":
                 return self.ctx.reply_handle()
-            case "refuse":
+            case "refuse" | True:
                 raise Unwilling
             case "circle":
                 assert self.ctx.sender is not None
