@@ -88,8 +88,10 @@ async def _mend(system: hf.ActorSystem, faults: Faults, names: Collection[str]) 
     """Take away what is wrong with these, and begin them anew, as a person would who was told of them."""
     for name in names:
         del faults.of[name]
-        with contextlib.suppress(hf.HoldfastError):  # It is being restarted at just this moment.
-            await system.ref("/app/all", hf.Supervisor).ask(hf.RestartChild(name, running=True))
+        with contextlib.suppress(hf.HoldfastError):
+            keeper = system.ref("/app/all", hf.Supervisor)
+            await keeper.ask(hf.TerminateChild(name), timeout=WITHIN)  # It may be starting, or hang in its end.
+            await keeper.ask(hf.RestartChild(name))
 
 
 def _names(components: tuple[str, ...]) -> tuple[str, ...]:
