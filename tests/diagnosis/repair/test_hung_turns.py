@@ -33,6 +33,9 @@ class Spin(hf.Message): ...
 class Signal(hf.Message): ...
 
 
+class End(hf.Message): ...
+
+
 class Rest(hf.Message):
     how: str
 
@@ -52,6 +55,14 @@ class Node(hf.Actor):
     @hf.on(Signal)
     def take(self, message: Signal) -> None:
         pass
+
+    @hf.on(End)
+    def end(self, message: End) -> None:
+        self.ctx.stop()
+
+    async def on_stop(self, reason: Any) -> None:
+        if reason == hf.NORMAL:
+            await asyncio.Event().wait()
 
     @hf.on(Count)
     def count(self, message: Count) -> int:
@@ -158,3 +169,21 @@ async def test_a_turn_that_hangs_behind_its_rest_is_seen() -> None:
         assert (await watching.diagnosis()).state is State.HEALTHY
         await asyncio.sleep(6.0)
         assert [one.bad for one in (await watching.diagnosis()).candidates] == [("all/node",)]
+
+
+@pytest.mark.asyncio(loop_factories=["virtual"])
+async def test_who_ends_by_itself_and_hangs_in_that_is_restarted_once_its_time_to_stop_is_over() -> None:
+    spec = hf.child("node", hf.start(Node), shutdown=5.0)
+    async with hf.ActorSystem("t", log=False) as system:
+        await system.start(hf.supervisor("all", children=[spec]))
+        node = system.ref("/t/all/node", Node)
+        repaired = asyncio.get_running_loop().create_future()
+        system.spawn(hf.start(Listener, repaired))
+        await diagnosis.watch(system, seconds=0.1, repair="on", policy=POLICY)
+        node.tell(End())
+        await asyncio.sleep(4.5)
+        assert len(system.lives(node)) == 1
+        async with asyncio.timeout(IN_TIME):
+            await repaired
+        assert await node.ask(Count()) == 1
+        assert len(system.lives(node)) == 2
