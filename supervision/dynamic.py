@@ -21,12 +21,23 @@ from ..actors.exit_reasons import SHUTDOWN, ExitReason
 from ..actors.kernel import lifecycle
 from ..actors.kernel.actor import Start, on
 from ..actors.kernel.cell import DOWN, GONE, Cell
-from ..actors.persistence import child_key
+from ..actors.persistence import child_key, plan_key
 from ..actors.process.resource_limits import Limits
 from .admin import AlreadyStarted, DeleteChild, MaxChildren, NotSupported, RestartChild, StartChild, opened
 from .awaited import EACH_LOOK, LOOK_AGAIN, TELL_AFTER, lives, not_there, tell_wait
 from .children import STARTING, Child, StartRow, complete, expect, tell_ended_with
-from .noted import FIELDS, Noted, OfTemplate, filled, first_noted, pack_noted, renewed, unpack_noted
+from .noted import (
+    FIELDS,
+    Noted,
+    OfTemplate,
+    filled,
+    first_noted,
+    noted_plan,
+    pack_noted,
+    pack_plan,
+    renewed,
+    unpack_noted,
+)
 from .rules import Rule
 from .spec import NAMELESS, ChildSpec, Flags, Isolation, Plan, Restart, Shutdown, check_spec, child
 from .supervisor import Supervisor, listed_at
@@ -52,8 +63,26 @@ class DynamicSupervisor(Supervisor):
     def _begin(self, plan: Plan) -> None:
         check_dynamic(type_name(type(self)), plan)
         self._count = 0
+        plan = self._in_force(plan)
         super()._begin(Plan.of(plan.flags, ()))
         self._template = plan.children[0] if plan.children else None
+
+    def _in_force(self, declared: Plan) -> Plan:
+        """The plan of this start: with what we were given while we worked, unless our recipe says something newer."""
+        key, keeper = plan_key(self.ctx.path), self.ctx._cell.node.ports.keeper
+        data = keeper.noted(key)
+        if data is None:
+            return declared
+        try:
+            plan = noted_plan(declared, data)
+            left = pack_plan(declared, plan)
+            if left != data:
+                keeper.note(key, left)
+        except HoldfastError as error:  # It stays in the journal: perhaps its class is only not there today.
+            why = f"what it was given while it worked cannot be had any more, so it begins as described: {error}"
+            self.ctx._cell.node.emit(ChildStartFailed(self.ctx.path, why))
+            return declared
+        return plan
 
     async def _start_all(self) -> None:
         """Start empty, or with the children that were there before, if there is a journal of them."""
@@ -61,8 +90,8 @@ class DynamicSupervisor(Supervisor):
         come: list[Child] = []
         for key, data in node.ports.keeper.notes(where).items():
             name = key.removeprefix(where)
-            if "/" in name:
-                continue  # It is the child of a supervisor below us.
+            if not name or "/" in name:
+                continue  # It is our own plan, or the child of a supervisor below us.
             if data == MADE_UP:
                 self._errand(self._lose(name))
                 continue
@@ -220,6 +249,18 @@ class DynamicSupervisor(Supervisor):
         """New flags and template; those who live now stay as they are, even if there are more than there may be."""
         check_dynamic(self.ctx.path, plan)
         self._flags, self._template = plan.flags, plan.children[0] if plan.children else None
+
+    def _keep_plan(self, plan: Plan, *, has_children: bool) -> None:
+        """With a journal it is noted, as the children are that it is for; else our recipe says it."""
+        key, keeper = plan_key(self.ctx.path), self.ctx._cell.node.ports.keeper
+        is_noted = plan.flags.journal and type(self).init is Supervisor.init
+        try:
+            keeper.note(key, pack_plan(self._given, plan) if is_noted else None)
+        except HoldfastError as error:
+            self.ctx._cell.node.emit(StoreRefused(self.ctx.path, str(error)))
+            is_noted = False
+        if not is_noted:
+            super()._keep_plan(plan, has_children=has_children)
 
     def _recipe_with(self, known: Any, given: tuple[ChildSpec, ...]) -> Any:
         """The template, if there is one."""

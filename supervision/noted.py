@@ -3,7 +3,8 @@
 A child that was made of the template comes back as the template says then, with the arguments of its own start and with
 all that was changed of it since. A change says what the template said when it was made: where the template says
 something else by now, that is newer, and counts. What is as in the template again is no change any more. All other
-children are noted whole.
+children are noted whole. A template that the supervisor was given while it worked is a change of the one that its
+recipe says, and noted in the same way; so are its flags.
 
 The mechanism is noted as it was when the child came: what has become of that has notes of its own.
 """
@@ -17,7 +18,7 @@ from typing import Any, TypeAlias
 from ..actors.errors import SpecError, type_name
 from ..actors.kernel.actor import Start
 from ..actors.process.wire.start_codec import pack_data, packed_digest, unpack_data
-from .spec import ChildSpec
+from .spec import ChildSpec, Plan
 
 Change: TypeAlias = "tuple[bytes, bytes]"
 """What the template said (a digest), and what the child says instead (packed)."""
@@ -104,6 +105,38 @@ def renewed(known: Noted | None, template: ChildSpec | None, before: ChildSpec, 
         if packed_digest(getattr(base, name), name) != packed_digest(said, name)
     }
     return first_noted(template, dataclasses.replace(base, **now)) if now else base
+
+
+def pack_plan(declared: Plan, now: Plan) -> bytes | None:
+    """What a dynamic supervisor was given and its recipe does not say; None: nothing.
+
+    Raises:
+        HoldfastError: it cannot be stored.
+    """
+    after = _parts(now)
+    changes: dict[str, Change] = {
+        name: (packed_digest(said, name), pack_data(after[name], name))
+        for name, said in _parts(declared).items()
+        if packed_digest(said, name) != packed_digest(after[name], name)
+    }
+    return pack_data(changes, "what it was given") if changes else None
+
+
+def noted_plan(declared: Plan, data: bytes) -> Plan:
+    """With what a dynamic supervisor begins whose recipe says `declared`.
+
+    Raises:
+        HoldfastError: what it was given cannot be had any more.
+    """
+    parts = _parts(declared)
+    for name, (before, packed) in unpack_data(data).items():
+        if before == packed_digest(parts[name], name):
+            parts[name] = unpack_data(packed)
+    return Plan.of(parts["flags"], parts["template"])
+
+
+def _parts(plan: Plan) -> dict[str, Any]:
+    return {"flags": plan.flags, "template": plan.children}
 
 
 def pack_noted(known: Noted, spec: ChildSpec) -> bytes:
