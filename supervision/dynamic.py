@@ -21,11 +21,11 @@ from ..actors.exit_reasons import SHUTDOWN, ExitReason
 from ..actors.kernel import lifecycle
 from ..actors.kernel.actor import Start, on
 from ..actors.kernel.cell import DOWN, GONE, Cell
-from ..actors.persistence import child_key, plan_key
+from ..actors.persistence import child_key, is_in_vain, plan_key
 from ..actors.process.resource_limits import Limits
 from .admin import AlreadyStarted, DeleteChild, MaxChildren, NotSupported, RestartChild, StartChild, opened
 from .awaited import EACH_LOOK, LOOK_AGAIN, TELL_AFTER, lives, not_there, tell_wait
-from .children import STARTING, Child, StartRow, complete, expect, tell_ended_with
+from .children import RESTARTING, STARTING, Child, StartRow, complete, expect, tell_ended_with
 from .noted import (
     FIELDS,
     Noted,
@@ -38,6 +38,7 @@ from .noted import (
     renewed,
     unpack_noted,
 )
+from .respec import respec
 from .rules import Rule
 from .spec import NAMELESS, ChildSpec, Flags, Isolation, Plan, Restart, Shutdown, check_spec, child
 from .supervisor import Supervisor, listed_at
@@ -205,6 +206,28 @@ class DynamicSupervisor(Supervisor):
         if self._flags.journal and self._is_in_place:
             self._try_to_note(one, note)
 
+    def _retry(self, one: Child, number: int, reason: ExitReason) -> None:
+        if number == one.retry and one.state == RESTARTING and is_in_vain(str(reason)):
+            self._renew(one)
+        super()._retry(one, number, reason)
+
+    def _renew(self, one: Child) -> None:
+        """A child whose code does not fit what is recorded of it is tried with that of the present template."""
+        if not isinstance(one.noted, OfTemplate) or self._template is None:
+            return
+        try:
+            start = one.noted.spec(self._template, one.spec.id, made_up=one.spec.made_up).start
+        except HoldfastError:
+            return  # Its arguments do not fit that one: it is tried as it is.
+        if start.kind is one.spec.start.kind:
+            return
+        if one.cell is not None and one.cell.state is not GONE:
+            one.cell.table = start.kind._table
+            respec(one.cell, start)
+        else:
+            before, one.spec = one.spec, dataclasses.replace(one.spec, start=start)
+            self._respecified(one, before)
+
     def _try_to_note(self, one: Child, note: Callable[[], None]) -> None:
         """A child has come, or gone, whatever the store says."""
         try:
@@ -252,15 +275,26 @@ class DynamicSupervisor(Supervisor):
 
     def _keep_plan(self, plan: Plan, *, has_children: bool) -> None:
         """With a journal it is noted, as the children are that it is for; else our recipe says it."""
+        if not self._note_plan(plan):
+            super()._keep_plan(plan, has_children=has_children)
+
+    def _note_plan(self, plan: Plan) -> bool:
+        """Note what we were given and our recipe does not say. False: we have no journal, or it could not be noted."""
+        if type(self).init is not Supervisor.init:
+            return False
         key, keeper = plan_key(self.ctx.path), self.ctx._cell.node.ports.keeper
-        is_noted = plan.flags.journal and type(self).init is Supervisor.init
         try:
-            keeper.note(key, pack_plan(self._given, plan) if is_noted else None)
+            note = pack_plan(self._given, plan) if plan.flags.journal else None
+            if note != keeper.noted(key):
+                keeper.note(key, note)
         except HoldfastError as error:
             self.ctx._cell.node.emit(StoreRefused(self.ctx.path, str(error)))
-            is_noted = False
-        if not is_noted:
-            super()._keep_plan(plan, has_children=has_children)
+            return False
+        return plan.flags.journal
+
+    def _set_flags(self, flags: Flags) -> None:
+        super()._set_flags(flags)
+        self._note_plan(Plan.of(flags, self._specs()))
 
     def _recipe_with(self, known: Any, given: tuple[ChildSpec, ...]) -> Any:
         """The template, if there is one."""

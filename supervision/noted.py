@@ -18,7 +18,7 @@ from typing import Any, TypeAlias
 from ..actors.errors import SpecError, type_name
 from ..actors.kernel.actor import Start
 from ..actors.process.wire.start_codec import pack_data, packed_digest, unpack_data
-from .spec import ChildSpec, Plan
+from .spec import ChildSpec, Flags, Plan
 
 Change: TypeAlias = "tuple[bytes, bytes]"
 """What the template said (a digest), and what the child says instead (packed)."""
@@ -26,6 +26,7 @@ Change: TypeAlias = "tuple[bytes, bytes]"
 OWN = ("id", "comes_back", "made_up")
 """The fields of a spec that are a child's own anyway."""
 FIELDS = tuple(field.name for field in dataclasses.fields(ChildSpec) if field.name not in OWN)
+FLAGS = tuple(field.name for field in dataclasses.fields(Flags))
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -132,11 +133,11 @@ def noted_plan(declared: Plan, data: bytes) -> Plan:
     for name, (before, packed) in unpack_data(data).items():
         if before == packed_digest(parts[name], name):
             parts[name] = unpack_data(packed)
-    return Plan.of(parts["flags"], parts["template"])
+    return Plan.of(Flags(**{name: parts[name] for name in FLAGS}), parts["template"])
 
 
 def _parts(plan: Plan) -> dict[str, Any]:
-    return {"flags": plan.flags, "template": plan.children}
+    return {"template": plan.children, **{name: getattr(plan.flags, name) for name in FLAGS}}
 
 
 def pack_noted(known: Noted, spec: ChildSpec) -> bytes:

@@ -931,6 +931,10 @@ class Supervisor(Inquiries):
         children = succession(self, self._children, plan)
         self._flags, self._children = plan.flags, children
 
+    def _set_flags(self, flags: Flags) -> None:
+        """Have other flags from now on; whoever sets them sees to our next lives."""
+        self._flags = flags
+
     def _keep_plan(self, plan: Plan, *, has_children: bool) -> None:
         """Have our next lives begin with a plan; without children of its own it leaves those as they are."""
         from .respec import keep_plan  # It asks here what a supervisor is.
