@@ -26,6 +26,8 @@ Change: TypeAlias = "tuple[bytes, bytes]"
 OWN = ("id", "comes_back", "made_up")
 """The fields of a spec that are a child's own anyway."""
 FIELDS = tuple(field.name for field in dataclasses.fields(ChildSpec) if field.name not in OWN)
+TEMPLATE = "template"
+OF_TEMPLATE = ("id", *FIELDS)
 FLAGS = tuple(field.name for field in dataclasses.fields(Flags))
 
 
@@ -114,10 +116,10 @@ def pack_plan(declared: Plan, now: Plan) -> bytes | None:
     Raises:
         HoldfastError: it cannot be stored.
     """
-    after = _parts(now)
-    changes: dict[str, Change] = {
-        name: (packed_digest(said, name), pack_data(after[name], name))
-        for name, said in _parts(declared).items()
+    before, after = _parts(declared, now), _parts(now, declared)
+    changes = {
+        name: (_digest(name, said), pack_data(after[name], name))
+        for name, said in before.items()
         if packed_digest(said, name) != packed_digest(after[name], name)
     }
     return pack_data(changes, "what it was given") if changes else None
@@ -129,15 +131,26 @@ def noted_plan(declared: Plan, data: bytes) -> Plan:
     Raises:
         HoldfastError: what it was given cannot be had any more.
     """
-    parts = _parts(declared)
+    parts = {TEMPLATE: declared.children, **_parts(declared, declared)}
     for name, (before, packed) in unpack_data(data).items():
-        if before == packed_digest(parts[name], name):
+        if name in parts and before == _digest(name, parts[name]):
             parts[name] = unpack_data(packed)
-    return Plan.of(Flags(**{name: parts[name] for name in FLAGS}), parts["template"])
+    flags = Flags(**{name: parts[name] for name in FLAGS})
+    of_template = {name: parts[name] for name in OF_TEMPLATE if name in parts}
+    return Plan.of(flags, [dataclasses.replace(one, **of_template) for one in parts[TEMPLATE]])
 
 
-def _parts(plan: Plan) -> dict[str, Any]:
-    return {"template": plan.children, **{name: getattr(plan.flags, name) for name in FLAGS}}
+def _parts(plan: Plan, other: Plan) -> dict[str, Any]:
+    """What may be changed of a plan: its flags, and its template, field by field if the other has one too."""
+    parts: dict[str, Any] = {name: getattr(plan.flags, name) for name in FLAGS}
+    if not (plan.children and other.children):
+        return {**parts, TEMPLATE: plan.children}
+    return {**parts, **{name: getattr(plan.children[0], name) for name in OF_TEMPLATE}}
+
+
+def _digest(name: str, said: Any) -> bytes:
+    """Digest what is said; of a start the class counts."""
+    return packed_digest(type_name(said.kind) if name == "start" else said, name)
 
 
 def pack_noted(known: Noted, spec: ChildSpec) -> bytes:
@@ -182,9 +195,8 @@ def _changed(before: ChildSpec, after: ChildSpec) -> set[str]:
 
 
 def _said(template: ChildSpec, field: str) -> bytes:
-    """What a template says of a field, as a digest; of its start the class counts."""
-    said = getattr(template, field)
-    return packed_digest(type_name(said.kind) if field == "start" else said, field)
+    """What a template says of a field, as a digest."""
+    return _digest(field, getattr(template, field))
 
 
 def _is_added_to(own: Start[Any], start: Start[Any]) -> bool:

@@ -137,17 +137,33 @@ async def test_a_new_template_in_the_source_counts_and_so_does_each_one_behind_i
 
 
 @pytest.mark.parametrize("place", ["task", "process"])
+async def test_another_option_in_the_source_leaves_the_class_that_it_was_given(
+    tmp_path: Path, place: Isolation
+) -> None:
+    store = f"sqlite:{tmp_path / 'app.db'}"
+    await player.first(store, "template", "template, orders", place, is_killed=False)
+    elsewhere = dataclasses.replace(player.member(None), bindings={"peer": "/app/second"})
+    async with hf.ActorSystem("app", store=store, log=False, intensity=100) as system:
+        *others, _ = player.trees("template")
+        for tree in (*others, hf.dynamic("team", template=elsewhere, journal=True, intensity=9, isolation=place)):
+            await system.start(tree)
+        assert await classes(system) == ALL_NEW
+        assert (await system.ref(player.at("one")).ask(player.Tell()))[3] == "/app/second"
+
+
+@pytest.mark.parametrize("place", ["task", "process"])
 async def test_whose_code_does_not_fit_what_it_has_recorded_is_tried_with_the_present_template(
     tmp_path: Path, place: Isolation
 ) -> None:
     store = f"sqlite:{tmp_path / 'app.db'}"
     await player.first(store, "template", "template, orders", place, is_killed=False)
     waits = {"backoff": hf.Backoff(initial=0.05, maximum=0.05)}
-    old, new = dataclasses.replace(player.member(None), **waits), dataclasses.replace(player.TEMPLATE, **waits)
+    wrong = dataclasses.replace(player.TEMPLATE, start=hf.start(player.Wrong), **waits)
+    new = dataclasses.replace(player.TEMPLATE, **waits)
     async with hf.ActorSystem("app", store=store, log=False, intensity=100) as system:
         *others, _ = player.trees("template")
         with system.events() as events:
-            for tree in (*others, hf.dynamic("team", template=old, journal=True, intensity=1000, isolation=place)):
+            for tree in (*others, hf.dynamic("team", template=wrong, journal=True, intensity=1000, isolation=place)):
                 await system.start(tree)
             failed = set[str]()
             while not ALL_NEW.keys() <= failed:
