@@ -103,6 +103,10 @@ def trees(kind: str, place: Isolation = "task") -> list[hf.ChildSpec]:
     return [*first, hf.supervisor("others", children=[IN], intensity=100), team]
 
 
+def of_template() -> list[hf.ChildSpec]:
+    return trees("template", "process")
+
+
 async def begin(system: hf.ActorSystem, kind: str, place: Isolation = "task") -> None:
     for tree in trees(kind, place):
         await system.start(tree)
