@@ -128,7 +128,8 @@ class NewProgram:
         if not spec.is_supervisor:
             return
         plan = self._plan(path, spec)
-        if (given := self._homes.noted(plan_key(path))) is not None:
+        given = self._homes.noted(plan_key(path)) if spec.start.kind.init is Supervisor.init else None
+        if given is not None:
             try:
                 plan = noted_plan(plan, given)
             except HoldfastError as error:

@@ -157,9 +157,9 @@ async def test_whose_code_does_not_fit_what_it_has_recorded_is_tried_with_the_pr
 ) -> None:
     store = f"sqlite:{tmp_path / 'app.db'}"
     await player.first(store, "template", "template, orders", place, is_killed=False)
-    waits = {"backoff": hf.Backoff(initial=0.05, maximum=0.05)}
-    wrong = dataclasses.replace(player.TEMPLATE, start=hf.start(player.Wrong), **waits)
-    new = dataclasses.replace(player.TEMPLATE, **waits)
+    waits = hf.Backoff(initial=0.05, maximum=0.05)
+    wrong: hf.ChildSpec = dataclasses.replace(player.member(None), start=hf.start(player.Wrong), backoff=waits)
+    new = dataclasses.replace(player.TEMPLATE, backoff=waits)
     async with hf.ActorSystem("app", store=store, log=False, intensity=100) as system:
         *others, _ = player.trees("template")
         with system.events() as events:
@@ -179,13 +179,12 @@ async def test_whose_code_does_not_fit_what_it_has_recorded_is_tried_with_the_pr
 
 @pytest.mark.parametrize("place", ["task", "process"])
 async def test_a_transaction_changes_flags_and_leaves_the_template(tmp_path: Path, place: Isolation) -> None:
-    """The flags that it does not name stay as the supervisor was given them, if it lives here."""
-    flags = {"intensity": 50, "period": 7.0, "journal": True}
+    flags = hf.supervision.Flags(intensity=50, period=7.0, journal=True)
     async with hf.ActorSystem("app", store=f"sqlite:{tmp_path / 'app.db'}", log=False, intensity=100) as system:
         await player.begin(system, "template", place)
         await player.renewed(system, "template, orders")
         team = system.ref("/app/team", hf.Supervisor)
-        await team.ask(hf.supervision.ChangeSupervisor(flags=hf.supervision.Flags(**flags)))
+        await team.ask(hf.supervision.ChangeSupervisor(flags=flags))
         for wanted in (100, 60):  # The first is what the program says.
             async with system.transaction() as change:
                 change.intensity(team, wanted, period=7.0)
