@@ -3,7 +3,9 @@
 from .actors.events import (
     ActorCrashed,
     ActorKilled,
+    ActorResumed,
     ActorStarted,
+    ActorSuspended,
     AutoShutdown,
     BindingAwaited,
     ChildRestarted,
@@ -103,7 +105,9 @@ from .system.transaction.events import (
 __all__ = [
     "ActorCrashed",
     "ActorKilled",
+    "ActorResumed",
     "ActorStarted",
+    "ActorSuspended",
     "AdaptationUndone",
     "AutoShutdown",
     "BackgroundWorkLost",

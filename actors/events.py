@@ -121,6 +121,21 @@ class ShutdownError(Event, frozen=True, eq=False):
     reason: ExitReason
 
 
+class ActorSuspended(Event, frozen=True, eq=False):
+    """An actor handles no message from now on, by the order of somebody: `by` says who.
+
+    That is the address of an actor, "the program", or "an operator".
+    """
+
+    by: str
+
+
+class ActorResumed(Event, frozen=True, eq=False):
+    """An actor handles messages again, by the order of somebody: `by` says who."""
+
+    by: str
+
+
 class StopOverdue(Event, frozen=True, eq=False):
     """An actor has not ended in the time that those below it have for it, and is killed with all of them.
 

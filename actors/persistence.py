@@ -151,6 +151,11 @@ def child_key(supervisor: str, name: str) -> str:
     return f"{CHILDREN}{supervisor}/{name}"
 
 
+def plan_key(supervisor: str) -> str:
+    """The key of the fact what a supervisor has been given while it worked: that of a child without a name."""
+    return child_key(supervisor, "")
+
+
 ENTRIES = "entries "
 """How the keys of facts begin that say what a recorded actor holds in a registry; both addresses follow."""
 

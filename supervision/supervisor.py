@@ -880,12 +880,10 @@ class Supervisor(Inquiries):
     @on(ChangeSupervisor)
     def _change(self, message: ChangeSupervisor) -> Any:
         """Take new flags and specs; nothing is started or stopped, and nothing changes if they are not valid."""
-        from .respec import keep_plan  # It asks here what a supervisor is.
-
         try:
             plan = new_plan(self, message)
             self._take(plan)
-            keep_plan(self, plan.flags, None if message.children is None else plan.children)
+            self._keep_plan(plan, has_children=message.children is not None or message.flags is None)
         except StartIgnored:
             return None
         except HoldfastError as error:
@@ -934,6 +932,16 @@ class Supervisor(Inquiries):
         """Follow another plan from now on; raises SpecError if that cannot be."""
         children = succession(self, self._children, plan)
         self._flags, self._children = plan.flags, children
+
+    def _set_flags(self, flags: Flags) -> None:
+        """Have other flags from now on; whoever sets them sees to our next lives."""
+        self._flags = flags
+
+    def _keep_plan(self, plan: Plan, *, has_children: bool) -> None:
+        """Have our next lives begin with a plan; without children of its own it leaves those as they are."""
+        from .respec import keep_plan  # It asks here what a supervisor is.
+
+        keep_plan(self, plan.flags, plan.children if has_children else None)
 
     def _recipe_with(self, known: Any, given: tuple[ChildSpec, ...]) -> Any:
         """What our next lives begin with if they are given these specs beside those that are known."""

@@ -14,6 +14,7 @@ import msgspec
 from ...actors.control.orders import Conclude, Order, Prepare, ReplaceCode, ReplaceState, Resume, Suspend
 from ...actors.control.orders_lane import order
 from ...actors.errors import ActorStopped, AskFailed, ControlFailed, NotSuspended
+from ...actors.events import ActorResumed, ActorSuspended
 from ...actors.kernel import mailbox
 from ...actors.kernel.actor import Start
 from ...actors.kernel.cell import Cell
@@ -22,6 +23,7 @@ from ...actors.process.wire.start_codec import unpack_recipe
 from ...checkpoint.home.recorded_home import switch_of
 from ...checkpoint.protocol import Snapshot
 from ...supervision.respec import respec
+from ..history.authors import author
 from ..live_moves import ended_too_often
 from .arrangement import busy
 from .operation import PROTECTED, StagedWork, wrong
@@ -138,6 +140,7 @@ class Rework(StagedWork):
         if self._is_ordered:
             if self.suspended is not None:
                 self._tell(cell, Suspend() if self.suspended else Resume())
+                self._report(cell)
             return
         self._put_recipe(cell)
         switch = switch_of(cell)
@@ -145,6 +148,11 @@ class Rework(StagedWork):
             for piece in self._saved:
                 switch.from_life(SNAPSHOT.decode(piece))
         self._tell(cell, Conclude(self._attempt, True, self.suspended))
+        self._report(cell)
+
+    def _report(self, cell: Cell) -> None:
+        if self.suspended is not None:
+            cell.node.emit((ActorSuspended if self.suspended else ActorResumed)(cell.path, author()))
 
     def _put_recipe(self, cell: Cell) -> None:
         """The next lives begin as the new class, wherever the actor is."""
