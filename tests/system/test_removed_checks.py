@@ -192,14 +192,14 @@ CHECKS = {
     ),
     "what a recorded actor says to an address whose home is unread is kept with its turn": Check(
         "checkpoint/home/outputs.py",
-        "is_there = not target.is_dead and not is_unread(target)",
-        "is_there = not target.is_dead",
+        "return is_away(target) and home",
+        "return target.is_dead and home",
         EXPECTED,
         "said_once and Tell",
     ),
     "what it asks there is kept with its turn": Check(
         "checkpoint/home/outputs.py",
-        "        if (target.is_dead or is_unread(target)) and switch_of",
+        "        if is_away(target) and switch_of",
         "        if target.is_dead and switch_of",
         EXPECTED,
         "said_once and Add",
