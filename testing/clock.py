@@ -190,7 +190,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         return self._virtual.now
 
     def unix_time(self) -> float:
-        """Seconds since 1970: the time when the loop was made (`epoch`, if given, is that of its 0), and what has passed."""
+        """Seconds since 1970, which pass as `time()`: at 0 it is `epoch`, or what makes it right when the loop is made."""
         return self._epoch + self._virtual.now
 
     def next_timer(self) -> float:

@@ -235,7 +235,7 @@ class TurnRows:
             return False
         commits.check()
         source = home.ledger.admit(MESSAGE, name, body, home.node.clock.wall(), sender)
-        source.ask, source.chain = ask, ask.chain
+        home.awaits(source, ask)
         home.forward(source)  # In front of the submission: the loop comes to its turn before it comes to the store.
         row = self._row
         if row is None or not row.takes(source):

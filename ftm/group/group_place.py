@@ -642,6 +642,9 @@ class GroupPlace(Place):
     def running(self, cell: Cell) -> int:
         return -1 if self.group is None else self.group.delivery.only_suspect_input()
 
+    def may_have_begun(self, cell: Cell, key: int) -> bool:
+        return False  # Of what was given to the replicas the ask itself says so.
+
 
 def as_spec(layers: tuple[Mechanism, ...]) -> Any:
     """Layers as a spec has them: one alone stands there as it is."""
