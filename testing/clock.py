@@ -190,7 +190,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         return self._virtual.now
 
     def unix_time(self) -> float:
-        """Seconds since 1970, which pass as `time()`: at 0 it is `epoch`, or what makes it right when the loop is made."""
+        """Seconds since 1970: `epoch` at 0; if that was left out, they were the machine's when the loop was made."""
         return self._epoch + self._virtual.now
 
     def next_timer(self) -> float:

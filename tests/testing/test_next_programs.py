@@ -1,4 +1,4 @@
-"""Programs in turn on one virtual clock: the next one goes on at the time that it is, and its waits know what passed."""
+"""Programs in turn on one virtual clock: the next one goes on at the time that it is, and its waits know that."""
 
 from __future__ import annotations
 
