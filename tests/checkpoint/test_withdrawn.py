@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import random
 import subprocess
 import sys
@@ -85,6 +86,33 @@ async def test_of_the_turn_in_hand_nobody_knows(tmp_path: Path, name: str, where
         with pytest.raises(hf.AskTimeout) as late:
             await ref.ask(Put("slow", 1.0), 0.5)
         assert late.value.handled is (None if "slow" in noted(tmp_path / "begun") else False)
+
+
+@pytest.mark.asyncio(loop_factories=["uvloop"])  # Behind what it has read it comes to its timers first.
+@pytest.mark.parametrize("where", ["process", "subtree"])
+async def test_nor_of_a_turn_that_has_ended_and_was_not_heard_of(tmp_path: Path, where: str) -> None:
+    """The root is at something else from the question until its time is over."""
+    loop, (heard, told) = asyncio.get_running_loop(), os.pipe()
+    async with system_for("memory", tmp_path) as system:
+        ref = await begun(system, tmp_path, where, method=hf.hybrid())
+        await ref.ask(Done(), LONG)
+        ends = time.monotonic() + 1.0 + SHORT
+
+        def block() -> None:
+            os.read(heard, 1)
+            while time.monotonic() < ends:
+                time.sleep(0.001)  # It is the loop that is blocked.
+
+        loop.add_reader(heard, block)
+        asked = ref.ask(Put("quick"), 1.0)
+        for _ in range(2):  # It is sent behind what is ready now.
+            await asyncio.sleep(0)
+        os.write(told, b".")
+        (said,) = await asyncio.gather(asked, return_exceptions=True)
+        loop.remove_reader(heard)
+        assert said == 1 or (isinstance(said, hf.AskTimeout) and said.handled is None)
+    os.close(heard)
+    os.close(told)
 
 
 @pytest.mark.parametrize(("where", "name"), [("task", "hybrid"), ("process", "replay_only"), ("subtree", "hybrid")])

@@ -126,4 +126,4 @@ async def test_a_stop_names_its_own_line() -> None:
         told = system.history(kinds=["StopWaits"]).events
         assert told
         assert (told[0].address, told[0].fields["waits_for"]) == ("/app/leaving", "")
-        assert "asyncio.sleep" in told[0].fields["at"]
+        assert "asyncio.sleep" in str(told[0].fields["at"])
