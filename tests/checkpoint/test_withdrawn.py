@@ -42,6 +42,7 @@ async def told_of(ref: hf.ActorRef[Slow], *names: str) -> list[bool | None]:
     return [one.handled for one in late if isinstance(one, hf.AskTimeout)]
 
 
+@pytest.mark.pairs
 @pytest.mark.parametrize("name", METHODS)
 @pytest.mark.parametrize("where", WHERE)
 @pytest.mark.parametrize("kept", STORES)
