@@ -24,6 +24,7 @@ from ..method import Method
 from ..recovery.recoveries import Recovery
 from ..snapshot.unreplayed import forget_turns
 from ..turn_word import input_of, may_have_begun
+from .admission import withdraw
 from .disposal import drop_all
 from .held_messages import (
     MAY_LIVE_AGAIN,
@@ -40,7 +41,6 @@ from .life_ports import RemoteLife, own_records
 from .present_life import LifePort
 from .recorded_home import RecordedHome
 from .switch import Switch
-from .withdrawal import withdraw
 
 if TYPE_CHECKING:
     from ...actors.kernel.address_host import Capacity, Parent

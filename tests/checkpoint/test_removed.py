@@ -30,7 +30,7 @@ WITHDRAWN = "tests/checkpoint/test_withdrawn.py"
 
 CHECKS = {
     "who is told that it was not handled is told behind the store": Check(
-        "checkpoint/home/withdrawal.py",
+        "checkpoint/home/admission.py",
         "        home.journal.submit(Withdrawal(home, source, then))\n",
         "        then(True)\n",
         GIVEN_UP,
