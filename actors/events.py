@@ -483,6 +483,22 @@ class TurnWaits(Event, frozen=True, eq=False):
     at: str
 
 
+class StopWaits(Event, frozen=True, eq=False):
+    """An actor has been stopping for longer than `watch_waits`, and nothing was cut off.
+
+    Of supervisors that wait for each other the lowest one tells. It is told again as `TurnWaits` is.
+
+    Attributes:
+        waits_for: the address of the child that is to end first; "" if it is its own `on_stop` that takes so long.
+        seconds: that it has taken so far, at least.
+        at: the line of the user's code at which that waits; "" if that is not known.
+    """
+
+    waits_for: str
+    seconds: float
+    at: str
+
+
 class LoopLagged(Event, frozen=True, eq=False):
     """The event loop of the root process came `seconds` late to what was due; `address` is the root's."""
 

@@ -126,6 +126,10 @@ class Home:
         """Whether the turn of an ask may have begun whose deadline is over, and which was handed on with a number."""
         return True
 
+    def withdraw(self, cell: Cell, ask: Ask, then: Callable[[bool], None]) -> None:
+        """See to it that such an ask, which has not begun, never does; `then` hears, soon, whether that is sure."""
+        then(True)  # Its deadline goes with it, and nothing of it outlives this process.
+
     def holds_back(self, cell: Cell) -> str:
         """Why replies of turns that have ended do not leave now; "" if nothing keeps them."""
         return ""
@@ -214,6 +218,10 @@ class Place:
     def running(self, cell: Cell) -> int:
         """The number of the input in hand, -1 if none is known."""
         return -1
+
+    def may_have_begun(self, cell: Cell, key: int) -> bool:
+        """Whether the present life may have begun a recorded input that has no end."""
+        return True
 
     def process(self, cell: Cell) -> Any:
         """The process besides this one that the present life is lived in, if there is one now."""
@@ -341,6 +349,9 @@ class AddressHost:
 
     def may_have_begun(self, cell: Cell, ask: Ask) -> bool:
         return self.home.may_have_begun(cell, ask)
+
+    def withdraw(self, cell: Cell, ask: Ask, then: Callable[[bool], None]) -> None:
+        self.home.withdraw(cell, ask, then)
 
     def holds_back(self, cell: Cell) -> str:
         return self.home.holds_back(cell)

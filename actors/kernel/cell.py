@@ -112,6 +112,10 @@ class Host(Protocol):
         """Whether the turn of an ask may have begun whose deadline is over, and which was handed on with a number."""
         ...
 
+    def withdraw(self, cell: Cell, ask: Ask, then: Callable[[bool], None]) -> None:
+        """See to it that such an ask, which has not begun, never does; `then` hears, soon, whether that is sure."""
+        ...
+
     def holds_back(self, cell: Cell) -> str:
         """Why replies of turns that have ended do not leave now; "" if nothing keeps them."""
         ...

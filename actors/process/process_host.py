@@ -295,6 +295,10 @@ class WorkerHome(Home):
         """The number of the input that a process has in hand, -1 if none is known."""
         return -1
 
+    def has_come_to(self, worker: Worker, key: int) -> bool:
+        """Whether a process may have begun a recorded input that has no end."""
+        return True
+
     def lost(self, cell: Cell, worker: Worker | None, reason: ExitReason) -> Callable[[bool | None], None] | None:
         """The process is gone, or the life in it has ended. Returns what is done when it is known what follows.
 
@@ -577,6 +581,10 @@ class WorkerPlace(Place):
     def running(self, cell: Cell) -> int:
         worker = self.workers.of(cell)
         return -1 if worker is None else self.home.in_hand(worker)
+
+    def may_have_begun(self, cell: Cell, key: int) -> bool:
+        worker = self.workers.of(cell)
+        return worker is not None and self.home.has_come_to(worker, key)
 
     def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
         worker = self.workers.of(cell)

@@ -340,7 +340,7 @@ class Outputs:
         """An ask to a recorded actor, up or not, is journaled in the same append."""
         origin = origin_of(ask) if isinstance(ask, SwitchAsk) else ""
         asked = switch.record(MESSAGE, out.name, out.body, sender, batch, origin)
-        asked.ask, asked.chain = ask, ask.chain
+        switch.awaits(asked, ask)
         batch.after.append(lambda: switch.admitted(asked))
 
     def _send_ask(self, key: int, target: Cell, ask: SwitchAsk) -> None:
@@ -374,7 +374,7 @@ class Outputs:
         if source is None or ask is None:
             self._deliver(target, turn, out, batch, None if source is None else source.sender)
             return
-        source.ask = None  # From now on it is the receiver's to answer.
+        source.ask, ask.started = None, True  # From now on it is the receiver's to answer.
         if out.trace:
             ask.chain = with_tail(ask.chain, out.trace)
             follow(ask)

@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Final
 
@@ -619,9 +618,9 @@ class Repairer(Actor):
 
     async def _tell(self, message: say.CaseNotice) -> None:
         if text := sentence(message):
-            what = type(message).__name__
-            self._memory.stories.add(message.case, say.StoryEntry(time.time(), what, text, about(message)))
-            self.ctx._cell.node.emit(say.RepairTold(self.ctx.path, message.case, what, text))
+            what, node = type(message).__name__, self.ctx._cell.node
+            self._memory.stories.add(message.case, say.StoryEntry(node.clock.wall(), what, text, about(message)))
+            node.emit(say.RepairTold(self.ctx.path, message.case, what, text))
         await self.ctx.publish(say.TOPIC, message)
         await self._keep()
 

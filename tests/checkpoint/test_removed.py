@@ -26,8 +26,30 @@ ORDER = "tests/checkpoint/test_order.py"
 REGISTRY = "tests/supervision/test_registry_recorded.py"
 ORDERS = "tests/checkpoint/test_restart_orders.py"
 GIVEN_UP = "tests/checkpoint/test_given_up.py"
+WITHDRAWN = "tests/checkpoint/test_withdrawn.py"
 
 CHECKS = {
+    "who is told that it was not handled is told behind the store": Check(
+        "checkpoint/home/admission.py",
+        "        home.journal.submit(Withdrawal(home, source, then))\n",
+        "        then(True)\n",
+        GIVEN_UP,
+        "the_next_program_handles and queued and hybrid",
+    ),
+    "what was put aside has begun": Check(
+        "checkpoint/home/journal_home.py",
+        "if source.was_cut or source.was_stashed or",
+        "if source.was_cut or",
+        GIVEN_UP,
+        "the_next_program_handles and stashed and hybrid",
+    ),
+    "a turn may have ended in a process, and the root has not heard of it": Check(
+        "checkpoint/home/journal_home.py",
+        "        return may_have_begun(worker.page[0], key)\n",
+        "        return key == input_of(worker.page[0])\n",
+        WITHDRAWN,
+        "was_not_heard_of and process",
+    ),
     "a recorded holder is found when it lives again": Check(
         "checkpoint/home/switch.py",
         "for come in self.node.awaited.pop(self.path, ()):",
@@ -79,7 +101,7 @@ CHECKS = {
     ),
     "a turn waits for no message whose asker has given up": Check(
         "checkpoint/long_waits.py",
-        "return is_wanted and not (source.begins_by and self._home.node.clock.is_past(source.begins_by))",
+        "return is_wanted and not self._is_given_up(source)",
         "return is_wanted",
         GIVEN_UP,
         "not_served and hybrid-task-waited",
@@ -842,8 +864,8 @@ CHECKS = {
     ),
     "a turn that rests is not blamed for the end of its process": Check(
         "checkpoint/life/recorded_life.py",
-        "0 if how and self.waits.resting else ",
-        "",
+        "OVER if how and self.waits.resting else how",
+        "how",
         "tests/effects/test_long_waits.py",
         "test_a_turn_waits_on_whatever_ends and process",
     ),
@@ -919,8 +941,8 @@ CHECKS = {
     ),
     "what ends the process beside a turn is what is blamed": Check(
         "checkpoint/life/glances.py",
-        "        life.page[0] = feed.id + 1",
-        "        life.page[0] = 0",
+        "        life.word.look(feed.id)",
+        "        life.word.mark(1 << 62)",
         "tests/effects/test_glances.py",
         "test_one_that_ends_the_process",
     ),

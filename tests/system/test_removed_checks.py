@@ -213,8 +213,8 @@ CHECKS = {
     ),
     "the page of a turn with an effect out is put back behind a question": Check(
         "checkpoint/life/glances.py",
-        "            life.page[0] = begun\n",
-        "            life.page[0] = 0\n",
+        "            life.word.mark(how)\n",
+        "            life.word.mark(1 << 62)\n",
         GLANCES,
         "held_against_its_turn",
     ),
