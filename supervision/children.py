@@ -13,6 +13,7 @@ from ..actors.events import ChildStopped
 from ..actors.exit_reasons import ExitReason
 from ..actors.kernel.cell import RUNNING, Cell
 from ..actors.kernel.envelope import Item
+from ..actors.persistence import is_in_vain
 from .admin import ChildInfo
 from .spec import ChildSpec
 
@@ -54,6 +55,12 @@ class Child:
     def is_running(self) -> bool:
         """Whether a life is lived there now, or is being brought back."""
         return self.state in (UP, RECOVERING)
+
+    @property
+    def in_vain(self) -> str:
+        """Why the restart for which it waits will fail as the last one did, in words; "" if that is not known."""
+        why = str(self.due) if self.state == RESTARTING and self.due is not None else ""
+        return why if is_in_vain(why) else ""
 
     def info(self, above: str) -> ChildInfo:
         """Describe the child as `WhichChildren` tells of it."""
@@ -244,12 +251,12 @@ class StartLimit:
 class RestartAgain(Item):
     """A restart that is due: after a failed attempt, or a back-off. Other requests are served before it."""
 
-    __slots__ = ("child", "number", "reason")
+    __slots__ = ("child", "is_counted", "number", "reason")
 
-    def __init__(self, child: Child, number: int, reason: ExitReason) -> None:
-        self.child, self.number, self.reason = child, number, reason
+    def __init__(self, child: Child, number: int, reason: ExitReason, *, is_counted: bool = True) -> None:
+        self.child, self.number, self.reason, self.is_counted = child, number, reason, is_counted
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
-        actor._retry(item.child, item.number, item.reason)
+        actor._retry(item)
         return None

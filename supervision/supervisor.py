@@ -485,11 +485,22 @@ class Supervisor(Inquiries):
         if not self.ctx._closed:
             self.ctx._cell.push(item)
 
-    def _retry(self, one: Child, number: int, reason: ExitReason) -> None:
+    def _retry(self, again: RestartAgain) -> None:
         """A restart is due, unless the child was stopped or started meanwhile."""
-        if number == one.retry and one.state == RESTARTING:
-            one.due = None
-            self._restart(one, reason)
+        one = again.child
+        if again.number != one.retry or one.state != RESTARTING:
+            return
+        one.due = None
+        if again.is_counted:
+            self._restart(one, again.reason)
+        else:
+            self._errand(self._bring_back(one, [one]))
+
+    def _hurry(self, one: Child, *, is_counted: bool = True) -> None:
+        """A child that waits for its restart is restarted now."""
+        if one.state == RESTARTING and one.due is not None:
+            one.retry += 1
+            self.ctx._cell.push(RestartAgain(one, one.retry, one.due, is_counted=is_counted))
 
     def _restart(self, one: Child, reason: ExitReason) -> None:
         """One attempt by the strategy, counted; gives up when there were too many."""
@@ -900,8 +911,7 @@ class Supervisor(Inquiries):
         for one in self._listed().values() if attempt else ():
             if one.state == RESTARTING and one.due is not None and one.hurried != attempt:
                 one.hurried = attempt
-                one.retry += 1
-                self.ctx._cell.push(RestartAgain(one, one.retry, one.due))
+                self._hurry(one)
 
     def _why_occupied(self) -> str:
         return why_occupied(self)
@@ -951,10 +961,18 @@ def _has_ended_by(one: Child, cause: str) -> bool:
     return reason.common_cause == cause and spec.backoff is None and spec.restarts(reason)
 
 
-def listed_at(cell: Cell) -> dict[str, Child] | None:
+def listed_at(cell: Cell | None) -> dict[str, Child] | None:
     """The children of a supervisor that lives in this process; None if there is none, or it has not begun."""
-    actor = cell.actor
+    actor = None if cell is None else cell.actor
     return actor._listed() if isinstance(actor, Supervisor) and "_children" in actor.__dict__ else None
+
+
+def try_again(cell: Cell) -> None:
+    """Start a child now that waits for its restart. That is by order, so it does not count."""
+    above = None if cell.parent is None else cell.parent.actor
+    one = above._listed().get(cell.name) if isinstance(above, Supervisor) else None
+    if isinstance(above, Supervisor) and one is not None and one.cell is cell:
+        above._hurry(one, is_counted=False)
 
 
 def kill_starting(top: Cell) -> None:

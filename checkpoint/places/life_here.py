@@ -54,7 +54,11 @@ class LifeHere(LifePlace):
         life = self.life = Life(cell, LocalHome(home, cell), home.method, home.page)
         for record in switch.restore_records():
             life.to_life(record)
-        life.begin(start, switch.ledger.state_turn, switch.ledger.stash)
+        try:
+            life.begin(start, switch.ledger.state_turn, switch.ledger.stash)
+        except StartFailed as error:
+            home.note_failed_start(error)
+            raise
         assert home.clock is not None
         home.clock.mark("restart")
 

@@ -1286,7 +1286,7 @@ CHECKS = {
     ),
     "who waits for a restart is not waited for": Check(
         "supervision/supervisor.py",
-        "                self.ctx._cell.push(RestartAgain(one, one.retry, one.due))\n",
+        "                self._hurry(one)\n",
         "                pass\n",
         KINDS,
         "test_who_waits_for_a_restart",

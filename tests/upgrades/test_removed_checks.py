@@ -8,6 +8,7 @@ TABLE = "tests/upgrades/test_what_a_change_does.py"
 READ = "tests/upgrades/test_where_records_are_read.py"
 MAPPING = "tests/upgrades/test_mapping.py"
 UNFIT = "tests/checkpoint/test_unfit_states.py"
+BEYOND = "tests/upgrades/test_beyond_recovery.py"
 
 CODE = "tests/control/test_code.py"
 
@@ -165,6 +166,41 @@ CHECKS = {
         "                pass",
         UNFIT,
         "test_a_supervisor_gives_up_at_once",
+    ),
+    "a class that fits is tried for a child that cannot be recovered": Check(
+        "system/transaction/rework.py",
+        "        self._begun_with = own\n        respec(",
+        '        raise ControlFailed(cell.path, "prepare", why)\n        respec(',
+        BEYOND,
+        "test_a_class_that_fits",
+    ),
+    "an attempt by order does not count": Check(
+        "supervision/supervisor.py",
+        "        above._hurry(one, is_counted=False)\n",
+        "        above._hurry(one)\n",
+        BEYOND,
+        "test_a_class_that_fits",
+    ),
+    "a child that cannot be recovered is not waited for": Check(
+        "system/transaction/rework.py",
+        "                if why := why_in_vain(cell):\n",
+        '                if why := "":\n',
+        BEYOND,
+        "test_what_cannot_be_tried",
+    ),
+    "what a process says of a failed start is remembered": Check(
+        "checkpoint/home/journal_home.py",
+        "            self.note_failed_start(error)\n            if not isinstance",
+        "            if not isinstance",
+        BEYOND,
+        "test_what_cannot_be_tried",
+    ),
+    "a class that was tried is taken back": Check(
+        "system/transaction/rework.py",
+        "                    respec(cell, self._begun_with, is_lent=True)\n",
+        "",
+        BEYOND,
+        "test_what_was_tried",
     ),
 }
 
