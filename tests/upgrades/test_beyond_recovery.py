@@ -120,6 +120,37 @@ async def test_what_cannot_be_tried_fails_at_once_and_says_why(tmp_path: Path, s
         assert await child.ask(Add()) == 3
 
 
+async def states_of(supervisor: hf.ActorRef[hf.Supervisor]) -> dict[str, str]:
+    """The children, as soon as none of them is about to begin."""
+    async with asyncio.timeout(30):
+        while True:
+            states = {one.id: one.state for one in await supervisor.ask(hf.WhichChildren())}
+            if "starting" not in states.values():
+                return states
+            await asyncio.sleep(0.01)
+
+
+async def test_a_way_back_that_was_cut_short_is_finished_by_the_new_release(tmp_path: Path) -> None:
+    names = ("p", "q")
+    async with program(tmp_path, counters(template(New))) as (system, supervisor):
+        children = [await supervisor.ask(hf.StartChild(id=name)) for name in names]
+        assert [await child.ask(Add()) for child in children] == [1, 1]
+        await supervisor.ask(hf.supervision.ChangeSupervisor(children=[template(Old)]))
+        await replace(system, Old, to_old)
+    async with program(tmp_path, counters(template(Old))) as (_, supervisor):
+        assert await states_of(supervisor) == {"p": "running", "q": "restarting"}
+    async with program(tmp_path, counters(template(New))) as (system, supervisor):
+        assert await states_of(supervisor) == {"p": "running", "q": "running"}
+        kinds = {name: (await system.get_status(f"/app/counters/{name}")).kind.rpartition(".")[2] for name in names}
+        assert kinds == {"p": "Old", "q": "New"}
+        await supervisor.ask(hf.supervision.ChangeSupervisor(children=[template(Old)]))
+        async with system.transaction() as change:
+            change.replace_code("/app/counters/q", Old, to_old)
+    async with program(tmp_path, counters(template(Old))) as (system, supervisor):
+        assert await states_of(supervisor) == {"p": "running", "q": "running"}
+        assert [await system.ref(f"/app/counters/{name}", Old).ask(Add()) for name in names] == [2, 2]
+
+
 class Broken(hf.Actor):
     def on_start(self, restored: bool) -> None:
         raise OSError("no such device")
