@@ -143,7 +143,7 @@ class StartChild(RuntimeOrder[Any]):
 
     spec: Any = None
     args: tuple[Any, ...] = ()
-    kwargs: dict[str, Any] = msgspec.field(default_factory=dict[str, Any])
+    kwargs: dict[str, Any] = msgspec.field(default_factory=dict)
     id: str | None = None
     fresh: bool = False
     candidate: int = 0
