@@ -175,7 +175,7 @@ class RestartChild(RuntimeOrder[Any]):
     a turn that has to be cut off for this did not end, which counts against its message as a death does: so asks
     repair, too, and else nobody's order counts. With `older` it
     begins with its snapshot before the newest; if there is none, one that ran goes on as it was, and the reply is
-    ControlFailed.
+    ControlFailed. With `at_once` one that runs is killed, and not asked to end: it may hear nothing.
     """
 
     id: str
@@ -184,6 +184,7 @@ class RestartChild(RuntimeOrder[Any]):
     unless_parked: bool = False
     older: bool = False
     blames_turn: bool = False
+    at_once: bool = False
 
 
 class DeleteChild(RuntimeOrder[None]):

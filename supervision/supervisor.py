@@ -833,6 +833,8 @@ class Supervisor(Inquiries):
             row = StartRow((one,), RESTARTING)
             if message.blames_turn and one.cell is not None:
                 one.cell.host.home.hangs(one.cell)
+            if message.at_once and one.cell is not None:
+                one.cell.kill()
             await self._stop(one, row=row, by=by, because="it was restarted by order")
             if one.row is not row:  # Whoever has it now says what becomes of it.
                 raise StartFailed(self._path_of(one), "it was stopped, or started by somebody else, meanwhile")

@@ -533,7 +533,7 @@ class RecordedContext(ActorContext):
         if life.stage.begun >= 0:
             life.say_it_waits()
         if life.stage.stopping is not None:
-            self._cell.node.loop.call_soon(life.leave_stranded)  # It may have had something else to wait for as well.
+            self._cell.node.loop.call_soon(life.leave_waiting)  # It has had something else to wait for.
 
     def _turn_goes_on(self) -> None:
         self.recorded.mark()

@@ -215,7 +215,7 @@ class Life:
                 self._perform(record)
             case Stranded():
                 self.waits.stranded |= {(record.turn, record.k)}
-                self.cell.node.loop.call_soon(self.leave_stranded)
+                self.cell.node.loop.call_soon(self.leave_waiting)
             case Glance():  # Not here and now: this may be called in a turn of the very actor.
                 self.cell.node.loop.call_soon(answer_beside, self, record.feed)
             case Go():
@@ -383,7 +383,7 @@ class Life:
                 self.handle_returned()
 
     def stop(self, reason: ExitReason) -> None:
-        """End in good order: behind the turn in hand, or in the middle of one that rests, for that may be for days.
+        """End in good order: behind the turn in hand, or in the middle of one that rests, also if it does so only then.
 
         So it is in one that waits for an answer of somebody who has been stopped before. The next life goes on with
         that. There is no snapshot of such a moment, and `on_stop` is not called in it.
@@ -396,14 +396,14 @@ class Life:
             return
         self.stage.stopping = reason
         self.cell.urge(StopRecorded(self, reason))
-        self.leave_stranded()
+        self.leave_waiting()
 
-    def leave_stranded(self) -> None:
-        """End in the middle of the turn in hand, if the life is to end and the turn waits for who has ended before."""
+    def leave_waiting(self) -> None:
+        """End in the middle of the turn in hand, if the life is to end, and that rests or waits for who has ended."""
         reason, turn = self.stage.stopping, None if self.cell.more is None else self.cell.more.turn
         if reason is None or turn is None or turn.then is not None or turn.killed or self.feed is None:
             return
-        if self.is_live and self.method.replays and self.waits.are_stranded:
+        if self.is_live and self.method.replays and (self.waits.resting or self.waits.are_stranded):
             if self.page is not None:
                 self.page[0] = 0  # No end of this life is due to the turn.
             self._leave(turn, reason)

@@ -119,6 +119,13 @@ CHECKS = {
         "tests/checkpoint/test_forwarded.py",
         "handed_on_is_not_lost and ask-unbounded",
     ),
+    "a stop ends a turn that comes to rest after it": Check(
+        "checkpoint/life/recorded_life.py",
+        "(self.waits.resting or self.waits.are_stranded)",
+        "self.waits.are_stranded",
+        "tests/effects/test_long_waits.py",
+        "before_the_turn_rests and call-effect",
+    ),
     "an ask is handed on to somebody who is not started yet": Check(
         "checkpoint/home/outputs.py",
         "and is_away(target)\n",

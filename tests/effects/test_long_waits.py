@@ -178,6 +178,81 @@ async def test_a_turn_goes_on_in_the_next_program(tmp_path: Path, isolation: str
         assert len(lines(world)) == 1
 
 
+class Waiting(hf.Actor):
+    """A turn that has an effect, or asks, and rests behind that."""
+
+    def __init__(self) -> None:
+        self.said: list[str] = []
+
+    @hf.on(Go)
+    async def go(self, message: Go) -> str:
+        for step in message.steps:
+            match step:
+                case "effect":
+                    self.said.append(await self.ctx.effect(opened, message.file, key="opened"))
+                case "ask":
+                    self.said.append(await self.ctx.find("/app/keeper", Keeper).ask(Open(message.file), IN_TIME))
+                case "sleep":
+                    await self.ctx.sleep(0.3)
+                case "long":
+                    await self.ctx.sleep(3600.0)
+                case _:
+                    self.said.append((await self.ctx.wait_for(Call, timeout=3600.0)).word)
+        return ", ".join(self.said)
+
+    @hf.on(Call)
+    def call(self, message: Call) -> None: ...
+
+    @hf.on(Look)
+    def look(self, message: Look) -> list[str]:
+        return self.said
+
+
+class Open(hf.Message[str]):
+    file: str
+
+
+class Keeper(hf.Actor):
+    @hf.on(Open)
+    async def open(self, message: Open) -> str:
+        return await opened(message.file)
+
+
+async def opened(file: str) -> str:
+    """Wait until the file is there, having said so."""
+    Path(f"{file}.asked").touch()
+    while not Path(file).exists():
+        await asyncio.sleep(0.005)
+    return "opened"
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+@pytest.mark.parametrize("first", ["effect", "ask"])
+@pytest.mark.parametrize("rest", [["call"], ["sleep", "call"], ["long"]], ids="-".join)
+async def test_a_stop_that_comes_before_the_turn_rests_ends_it_when_it_does(
+    tmp_path: Path, isolation: Any, first: str, rest: list[str]
+) -> None:
+    gate = tmp_path / "gate"
+    spec: Any = hf.child(
+        "waiting", hf.start(Waiting), isolation=isolation, recovery=hf.hybrid(interval=1000.0), shutdown="infinity"
+    )
+    async with running(tmp_path, "os") as system:
+        await system.start(hf.child("keeper", hf.start(Keeper)))
+        ref = await system.start(spec)
+        ref.tell(Go([first, *rest], str(gate)))
+        async with asyncio.timeout(IN_TIME):
+            while not Path(f"{gate}.asked").exists():
+                await asyncio.sleep(0.005)
+            order = hf.RestartChild("waiting", running=True)
+            restarted = asyncio.ensure_future(system.ref("/app", hf.Supervisor).ask(order, IN_TIME))
+            await asyncio.sleep(0)  # It has been told.
+            gate.touch()
+            await restarted
+        if rest != ["long"]:
+            ref.tell(Call("came"))
+            assert await ref.ask(Look(), IN_TIME) == ["opened", "came"]
+
+
 @pytest.mark.parametrize("isolation", ["task", "process"])
 @pytest.mark.parametrize("below", ["root", "supervisor", "process"])
 async def test_a_turn_that_was_asked_goes_on_too(tmp_path: Path, isolation: Any, below: str) -> None:

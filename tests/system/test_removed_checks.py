@@ -407,6 +407,20 @@ CHECKS = {
         TURNS,
         "crashes_its_actor_to_the_instant",
     ),
+    "whoever ends the loop does not wait for an abandoned turn": Check(
+        "actors/kernel/lifecycle.py",
+        "    let_go(turn.runner.task)\n",
+        "",
+        "tests/system/test_run.py",
+        "swallows_its_cancellation and asyncio",
+    ),
+    "what runs beside a program keeps it from no end": Check(
+        "system/run.py",
+        "await _end_tasks()",
+        "pass",
+        "tests/system/test_run.py",
+        "swallows_its_cancellation and beside",
+    ),
     "who swallows that is abandoned": Check(
         "actors/kernel/lifecycle.py",
         "                loop.call_later(GRACE, abandon, turn)\n                return\n",

@@ -1,6 +1,8 @@
 """A message whose turn never ends: repair restarts its actor, and the second end in a row puts the message aside."""
 
 import asyncio
+import os
+import signal
 from typing import Any
 
 import pytest
@@ -104,6 +106,25 @@ async def test_an_actor_whose_turn_hangs_again_is_healed_by_repair(isolation: An
         assert (type(aside.message), aside.attempts) == (type(bad), 2)
         assert await node.ask(Count(), timeout=IN_TIME) == last + 1
         assert (await watching.diagnosis()).state is State.HEALTHY
+
+
+@pytest.mark.asyncio(loop_factories=["uvloop"])
+@pytest.mark.parametrize("recovery", [None, hf.hybrid()], ids=["plain", "recorded"])
+async def test_who_hears_nothing_is_not_given_the_time_to_end(recovery: Any) -> None:
+    spec = hf.child("node", hf.start(Node), isolation="process", recovery=recovery, shutdown=600.0)
+    async with hf.ActorSystem("t", log=False) as system:
+        await system.start(hf.supervisor("all", children=[spec], intensity=20))
+        node = system.ref("/t/all/node", Node)
+        repaired = asyncio.get_running_loop().create_future()
+        system.spawn(hf.start(Listener, repaired))
+        await node.ask(Count(), timeout=IN_TIME)
+        await diagnosis.watch(system, seconds=0.1, hung_after=0.5, repair="on", policy=POLICY)
+        os.kill(system.pid_of(node), signal.SIGSTOP)
+        async with asyncio.timeout(IN_TIME):
+            while not repaired.done():
+                await asyncio.wait([node.ask(Count(), timeout=1.0), repaired], return_when=asyncio.FIRST_COMPLETED)
+        assert await node.ask(Count(), timeout=IN_TIME) > 0
+        assert len(system.lives(node)) == 2
 
 
 @pytest.mark.parametrize("isolation", ["task", "process"])
