@@ -251,12 +251,23 @@ class StartLimit:
 class RestartAgain(Item):
     """A restart that is due: after a failed attempt, or a back-off. Other requests are served before it."""
 
-    __slots__ = ("child", "is_counted", "number", "reason")
+    __slots__ = ("child", "number", "reason")
 
-    def __init__(self, child: Child, number: int, reason: ExitReason, *, is_counted: bool = True) -> None:
-        self.child, self.number, self.reason, self.is_counted = child, number, reason, is_counted
+    def __init__(self, child: Child, number: int, reason: ExitReason) -> None:
+        self.child, self.number, self.reason = child, number, reason
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
-        actor._retry(item)
+        actor._retry(item.child, item.number, item.reason)
+        return None
+
+
+class StartNow(RestartAgain):
+    """A child that waits for its restart is started now, as its spec says. That is by order, so it does not count."""
+
+    __slots__ = ()
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        actor._start_now(item.child, item.number)
         return None

@@ -43,6 +43,7 @@ from .children import (
     Child,
     RestartAgain,
     StartLimit,
+    StartNow,
     StartRow,
     begin_start,
     bind_expected,
@@ -485,22 +486,17 @@ class Supervisor(Inquiries):
         if not self.ctx._closed:
             self.ctx._cell.push(item)
 
-    def _retry(self, again: RestartAgain) -> None:
+    def _retry(self, one: Child, number: int, reason: ExitReason) -> None:
         """A restart is due, unless the child was stopped or started meanwhile."""
-        one = again.child
-        if again.number != one.retry or one.state != RESTARTING:
-            return
-        one.due = None
-        if again.is_counted:
-            self._restart(one, again.reason)
-        else:
-            self._errand(self._bring_back(one, [one]))
+        if number == one.retry and one.state == RESTARTING:
+            one.due = None
+            self._restart(one, reason)
 
-    def _hurry(self, one: Child, *, is_counted: bool = True) -> None:
-        """A child that waits for its restart is restarted now."""
-        if one.state == RESTARTING and one.due is not None:
-            one.retry += 1
-            self.ctx._cell.push(RestartAgain(one, one.retry, one.due, is_counted=is_counted))
+    def _start_now(self, one: Child, number: int) -> None:
+        """As `_retry`, by order."""
+        if number == one.retry and one.state == RESTARTING:
+            one.due = None
+            self._errand(self._bring_back(one, [one]))
 
     def _restart(self, one: Child, reason: ExitReason) -> None:
         """One attempt by the strategy, counted; gives up when there were too many."""
@@ -913,7 +909,8 @@ class Supervisor(Inquiries):
         for one in self._listed().values() if attempt else ():
             if one.state == RESTARTING and one.due is not None and one.hurried != attempt:
                 one.hurried = attempt
-                self._hurry(one)
+                one.retry += 1
+                self.ctx._cell.push(RestartAgain(one, one.retry, one.due))
 
     def _why_occupied(self) -> str:
         return why_occupied(self)
@@ -970,11 +967,11 @@ def listed_at(cell: Cell | None) -> dict[str, Child] | None:
 
 
 def try_again(cell: Cell) -> None:
-    """Start a child now that waits for its restart. That is by order, so it does not count."""
-    above = None if cell.parent is None else cell.parent.actor
-    one = above._listed().get(cell.name) if isinstance(above, Supervisor) else None
-    if isinstance(above, Supervisor) and one is not None and one.cell is cell:
-        above._hurry(one, is_counted=False)
+    """Start a child now that waits for its restart, if its supervisor lives in this process."""
+    one = (listed_at(cell.parent) or {}).get(cell.name)
+    if cell.parent is not None and one is not None and one.cell is cell and one.due is not None:
+        one.retry += 1
+        cell.parent.push(StartNow(one, one.retry, one.due))
 
 
 def kill_starting(top: Cell) -> None:

@@ -1300,7 +1300,7 @@ CHECKS = {
     ),
     "who waits for a restart is not waited for": Check(
         "supervision/supervisor.py",
-        "                self._hurry(one)\n",
+        "                self.ctx._cell.push(RestartAgain(one, one.retry, one.due))\n",
         "                pass\n",
         KINDS,
         "test_who_waits_for_a_restart",

@@ -175,9 +175,9 @@ CHECKS = {
         "test_a_class_that_fits",
     ),
     "an attempt by order does not count": Check(
-        "supervision/supervisor.py",
-        "        above._hurry(one, is_counted=False)\n",
-        "        above._hurry(one)\n",
+        "supervision/children.py",
+        "        actor._start_now(item.child, item.number)\n",
+        "        actor._retry(item.child, item.number, item.reason)\n",
         BEYOND,
         "test_a_class_that_fits",
     ),
