@@ -113,11 +113,7 @@ class JournalHome(RecordedHome):
     def enter(self, cell: Cell) -> Entered:
         """As `open`, and it is a recovery if anything comes back, or if one is not over."""
         self.in_vain = ""
-        try:
-            entered = self.open(cell)
-        except StartFailed as error:
-            self.note_failed_start(error)
-            raise
+        entered = self.open(cell)
         entered.switch.life.follow()
         recoveries = self.homes.recoveries
         self.recovery = None
@@ -430,7 +426,6 @@ class JournalHome(RecordedHome):
             if switch.life.port is None:
                 return  # As above.
         except HoldfastError as error:
-            self.note_failed_start(error)
             if not isinstance(error, StartIgnored):
                 node.emit(RecoveryFailed(cell.path, str(error)))
             raise error if isinstance(error, StartFailed) else StartFailed(cell.path, str(error)) from error
@@ -438,7 +433,6 @@ class JournalHome(RecordedHome):
             diverged = switch.life.diverged
             if diverged is None:
                 raise StartFailed(cell.path, "it was stopped while it started") from None
-            self.note_failed_start(diverged)
             node.emit(RecoveryFailed(cell.path, str(diverged)))
             raise StartFailed(cell.path, str(diverged)) from diverged
         finally:
@@ -451,10 +445,8 @@ class JournalHome(RecordedHome):
                 node.emit(Recovered(cell.path, cell.life, switch.life.replayed, clock.phases(restore_seconds)))
         self.homes.recoveries.over(cell.path)
 
-    def note_failed_start(self, error: HoldfastError) -> None:
-        """Remember why a start has failed, if each further one will."""
-        why = error.reason if isinstance(error, StartFailed) else str(error)
-        self.in_vain = why if is_in_vain(why) else ""
+    def start_failed(self, error: StartFailed) -> None:
+        self.in_vain = error.reason if is_in_vain(error.reason) else ""
 
     async def _let_at(self, switch: Switch, clock: RecoveryClock, restore_seconds: float) -> None:
         """S4, if anybody has a say in it; else the home has done it.

@@ -54,11 +54,7 @@ class LifeHere(LifePlace):
         life = self.life = Life(cell, LocalHome(home, cell), home.method, home.page)
         for record in switch.restore_records():
             life.to_life(record)
-        try:
-            life.begin(start, switch.ledger.state_turn, switch.ledger.stash)
-        except StartFailed as error:
-            home.note_failed_start(error)
-            raise
+        life.begin(start, switch.ledger.state_turn, switch.ledger.stash)
         assert home.clock is not None
         home.clock.mark("restart")
 

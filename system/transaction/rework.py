@@ -246,7 +246,8 @@ class Rework(StagedWork):
                 if self._begun_with is not None:
                     respec(cell, self._begun_with, is_lent=True)
                     cell.kill()  # If it has come back: as the class that it is not to become.
-                if self._held is None or self._begun_with is not None:  # It obeys this when it comes to it.
+                    self._held = None
+                if self._held is None:  # It has not come to it so far, and obeys this behind it.
                     concluded.add_done_callback(seen)
                 else:
                     await concluded

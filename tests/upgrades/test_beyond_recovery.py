@@ -162,9 +162,10 @@ async def replace_and_fail(system: hf.ActorSystem) -> None:
         change.add("/app", hf.child("broken", hf.start(Broken)))
 
 
-async def test_what_was_tried_is_taken_back_with_the_transaction(tmp_path: Path) -> None:
+@pytest.mark.parametrize("place", ["task", "process"])
+async def test_what_was_tried_is_taken_back_with_the_transaction(tmp_path: Path, place: Place) -> None:
     await recorded_by(New, tmp_path)
-    async with program(tmp_path, counters(template(Old, seconds=0.05), intensity=1000)) as (system, supervisor):
+    async with program(tmp_path, counters(template(Old, place, seconds=0.05), intensity=1000)) as (system, supervisor):
         await is_beyond(supervisor)
         with pytest.raises(hf.TransactionFailed, match="no such device"):
             await replace_and_fail(system)
