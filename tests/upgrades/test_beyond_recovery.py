@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Literal
@@ -59,7 +59,7 @@ def counters(template: hf.ChildSpec, supervised: Place = "task", *, intensity: i
 
 
 @asynccontextmanager
-async def program(store: Path, spec: hf.ChildSpec) -> AsyncIterator[tuple[hf.ActorSystem, hf.ActorRef[hf.Supervisor]]]:
+async def program(store: Path, spec: hf.ChildSpec) -> AsyncGenerator[tuple[hf.ActorSystem, hf.ActorRef[hf.Supervisor]]]:
     async with hf.ActorSystem("app", store=f"sqlite:{store}/app.db", log=False) as system:
         yield system, await system.start(spec)
 
