@@ -172,7 +172,8 @@ class ChildSpec(Generic[A_co]):
             try:
                 pack_recipe(self.start, where)
             except UnsavableValue as error:
-                raise SpecError(error.where, f"{error.problem} cannot be sent to another process") from error
+                advice = "give plain data, and have `__init__` make the rest of it there"
+                raise SpecError(error.where, f"{error.problem} cannot be sent to another process: {advice}") from error
 
     @property
     def has_home(self) -> bool:

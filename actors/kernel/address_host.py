@@ -33,6 +33,7 @@ class Work(NamedTuple):
         has_answered: what it has in hand, or had last, is an ask, and whoever made that has an answer.
         own_turns: times its process was seen to have got on, by turns that the home knows nothing of, too (of timers,
             say); it is as new as the last answer to `Home.ask_turns`.
+        newest: the ask that `has_answered` is about, if that is known as such.
     """
 
     mark: object = None
@@ -40,6 +41,7 @@ class Work(NamedTuple):
     since: float | None = None
     has_answered: bool = False
     own_turns: int = 0
+    newest: object = None
 
 
 class Capacity(Protocol):
@@ -91,7 +93,7 @@ class Home:
         """What the actor is at; `running` is the number of the input in hand, -1 if none is known."""
         turn, item = cell.more.turn if cell.more is not None else None, cell.item
         has_answered = isinstance(item, Ask) and item.is_done
-        return Work(item, turn is not None, None if turn is None else turn.since, has_answered)
+        return Work(item, turn is not None, None if turn is None else turn.since, has_answered, newest=item)
 
     def rests(self, cell: Cell) -> list[TurnRest]:
         """What the turn in hand waits for that is no other actor's work; empty if that is not known in this process."""

@@ -404,8 +404,8 @@ class FlightHome(WorkerHome):
         newest = outlet.trim()
         has_answered = isinstance(newest, Ask) and newest.is_done
         if outlet.flight:
-            return Work(outlet.flight[0][1], True, None, has_answered, outlet.own_turns.seen)
-        return Work(outlet.sent, False, None, has_answered, outlet.own_turns.seen)
+            return Work(outlet.flight[0][1], True, None, has_answered, outlet.own_turns.seen, newest)
+        return Work(outlet.sent, False, None, has_answered, outlet.own_turns.seen, newest)
 
     def rests(self, cell: Cell) -> list[TurnRest]:
         outlet: Outlet | None = cell.extra().outlet

@@ -45,6 +45,20 @@ CHECKS = {
         HUNG,
         "rests_as_it_has_said and wait and task",
     ),
+    "who hangs in an end that nobody has ordered is left to nobody": Check(
+        "supervision/arbiter.py",
+        " and not _hangs_in_its_end(child, cell):",
+        ":",
+        HUNG,
+        "ends_by_itself",
+    ),
+    "an end may take as long as its supervisor gives it": Check(
+        "supervision/arbiter.py",
+        "return cell.node.loop.time() - turn.since > child.spec.shutdown",
+        "return True",
+        HUNG,
+        "ends_by_itself",
+    ),
     "that a recorded turn in a process rests is known": Check(
         "diagnosis/observers/node_observer.py",
         "status = known_at_home(told, cell)",
