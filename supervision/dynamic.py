@@ -347,7 +347,8 @@ class DynamicSupervisor(Supervisor):
     async def _check_free(self, spec: ChildSpec) -> None:
         known = await self._come_so_far(spec.id)
         if known is not None:
-            raise AlreadyStarted(spec.id, self.ctx._cell.node.cell_at(f"{self.ctx.path}/{spec.id}").ref)
+            ref = self.ctx._cell.node.cell_at(f"{self.ctx.path}/{spec.id}").ref
+            raise AlreadyStarted(spec.id, ref, known.in_vain)
         most = self._flags.max_children
         if most is not None and len(self._children) >= most:
             self.ctx._cell.node.numbers.no_room["children", spec.start.kind] += 1

@@ -43,6 +43,7 @@ from .children import (
     Child,
     RestartAgain,
     StartLimit,
+    StartNow,
     StartRow,
     begin_start,
     bind_expected,
@@ -490,6 +491,12 @@ class Supervisor(Inquiries):
         if number == one.retry and one.state == RESTARTING:
             one.due = None
             self._restart(one, reason)
+
+    def _start_now(self, one: Child, number: int) -> None:
+        """As `_retry`, by order."""
+        if number == one.retry and one.state == RESTARTING:
+            one.due = None
+            self._errand(self._bring_back(one, [one]))
 
     def _restart(self, one: Child, reason: ExitReason) -> None:
         """One attempt by the strategy, counted; gives up when there were too many."""
@@ -961,10 +968,18 @@ def _has_ended_by(one: Child, cause: str) -> bool:
     return reason.common_cause == cause and spec.backoff is None and spec.restarts(reason)
 
 
-def listed_at(cell: Cell) -> dict[str, Child] | None:
+def listed_at(cell: Cell | None) -> dict[str, Child] | None:
     """The children of a supervisor that lives in this process; None if there is none, or it has not begun."""
-    actor = cell.actor
+    actor = None if cell is None else cell.actor
     return actor._listed() if isinstance(actor, Supervisor) and "_children" in actor.__dict__ else None
+
+
+def try_again(cell: Cell) -> None:
+    """Start a child now that waits for its restart, if its supervisor lives in this process."""
+    one = (listed_at(cell.parent) or {}).get(cell.name)
+    if cell.parent is not None and one is not None and one.cell is cell and one.due is not None:
+        one.retry += 1
+        cell.parent.push(StartNow(one, one.retry, one.due))
 
 
 def kill_starting(top: Cell) -> None:

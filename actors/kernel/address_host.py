@@ -10,6 +10,7 @@ import asyncio
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
+from ..errors import StartFailed
 from ..events import ActorKilled
 from .cell import RUNNING, TurnRest
 from .envelope import Ask, Item
@@ -64,6 +65,9 @@ class Home:
     def push(self, cell: Cell, item: Item) -> None:
         """Put an item of the runtime's own in its place behind the messages."""
         raise NotImplementedError
+
+    def start_failed(self, error: StartFailed) -> None:
+        """Hear why no life has begun."""
 
     def offer(self, cell: Cell, item: Any) -> Awaitable[None] | None:
         """Admit a message for a sender that waits until it is accepted. None: it is."""
@@ -359,7 +363,19 @@ class AddressHost:
     # -- the place's ------------------------------------------------------------------------------------------------
 
     def start(self, cell: Cell) -> asyncio.Future[None] | None:
-        return self.place.start(cell)
+        try:
+            up = self.place.start(cell)
+        except StartFailed as error:
+            self.home.start_failed(error)
+            raise
+        if up is not None:
+            up.add_done_callback(self._started)
+        return up
+
+    def _started(self, up: asyncio.Future[None]) -> None:
+        error = None if up.cancelled() else up.exception()
+        if isinstance(error, StartFailed):
+            self.home.start_failed(error)
 
     def stop(self, cell: Cell, reason: ExitReason) -> None:
         self.place.stop(cell, reason)

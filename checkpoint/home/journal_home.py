@@ -19,7 +19,7 @@ from ...actors.kernel import links
 from ...actors.kernel.address_host import Work
 from ...actors.kernel.cell import RUNNING, Cell, TurnRest
 from ...actors.kernel.lifecycle import MAILBOX
-from ...actors.persistence import UNFIT
+from ...actors.persistence import UNFIT, is_in_vain
 from ..method import Method
 from ..recovery.recoveries import Recovery
 from ..snapshot.unreplayed import forget_turns
@@ -114,6 +114,7 @@ class JournalHome(RecordedHome):
 
     def enter(self, cell: Cell) -> Entered:
         """As `open`, and it is a recovery if anything comes back, or if one is not over."""
+        self.in_vain = ""
         entered = self.open(cell)
         entered.switch.life.follow()
         recoveries = self.homes.recoveries
@@ -470,6 +471,9 @@ class JournalHome(RecordedHome):
             if node.events.has_listeners:
                 node.emit(Recovered(cell.path, cell.life, switch.life.replayed, clock.phases(restore_seconds)))
         self.homes.recoveries.over(cell.path)
+
+    def start_failed(self, error: StartFailed) -> None:
+        self.in_vain = error.reason if is_in_vain(error.reason) else ""
 
     async def _let_at(self, switch: Switch, clock: RecoveryClock, restore_seconds: float) -> None:
         """S4, if anybody has a say in it; else the home has done it.
