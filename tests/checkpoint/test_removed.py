@@ -25,9 +25,24 @@ BETWEEN = "tests/checkpoint/test_between_lives.py"
 ORDER = "tests/checkpoint/test_order.py"
 REGISTRY = "tests/supervision/test_registry_recorded.py"
 ORDERS = "tests/checkpoint/test_restart_orders.py"
+ONCE = "tests/checkpoint/test_orders_once.py"
 GIVEN_UP = "tests/checkpoint/test_given_up.py"
 
 CHECKS = {
+    "an order is an output of its turn": Check(
+        "checkpoint/life/recorded_context.py",
+        "            self.recorded.put(order, cell.path)\n",
+        "            super()._order(cell, order)\n",
+        ONCE,
+        "test_it_is_carried_out_once and task",
+    ),
+    "an order that nothing grants is refused where it is given": Check(
+        "checkpoint/life/recorded_context.py",
+        "                cell.require_order(order)\n",
+        "                pass\n",
+        ONCE,
+        "test_a_process_orders_those_alone",
+    ),
     "a recorded holder is found when it lives again": Check(
         "checkpoint/home/switch.py",
         "for come in self.node.awaited.pop(self.path, ()):",
