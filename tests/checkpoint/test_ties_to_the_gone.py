@@ -55,7 +55,7 @@ def test_who_does_not_come_back_is_told_of_once(
 def test_who_may_come_back_is_waited_for(
     tmp_path: Path, isolation: str, kind: str, place: str, order: str, end: str
 ) -> None:
-    """One of a list that was not started yet, one that goes on with what is recorded, one that its supervisor brings."""
+    """One of a list that was not started yet, one that goes on with its records, one that its supervisor brings."""
     told = [tmp_path / "app.db", isolation, kind, place, order]
     run(*told, end)
     path, before, after = run(*told, "told")
