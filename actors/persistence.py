@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Collection
 from typing import Protocol
 
 from .errors import DIVERGED, RAISED_AGAIN, ControlFailed, ReplayDiverged, type_name
@@ -82,6 +83,10 @@ class Keeper(Protocol):
         """
         ...
 
+    def began(self, path: str, listed: Collection[str]) -> None:
+        """The supervisor at `path` begins with these children: nobody else is brought back below it."""
+        ...
+
     def note(self, key: str, value: bytes | None) -> None:
         """Keep a small fact; None forgets it. Raises HoldfastError if the store refused."""
         ...
@@ -126,6 +131,9 @@ class NothingKept:
 
     def dismissed(self, path: str, *, below: bool, for_good: bool) -> None:
         """Do nothing: nothing waits for a next life."""
+
+    def began(self, path: str, listed: Collection[str]) -> None:
+        """Do nothing: nobody is tied to who has lived before this node."""
 
     def note(self, key: str, value: bytes | None) -> None:
         """Keep a fact until the node ends."""

@@ -104,6 +104,7 @@ class DynamicSupervisor(Supervisor):
             except HoldfastError as error:  # It stays in the journal: perhaps its class is only not there today.
                 node.emit(ChildStartFailed(f"{self.ctx.path}/{name}", str(error)))
         self._children.update((one.spec.id, one) for one in come)
+        self._tell_begun()
         self._expect(come)
         waiting = await self._come_back(come)
         if waiting:

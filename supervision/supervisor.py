@@ -176,7 +176,12 @@ class Supervisor(Inquiries):
 
     async def _start_all(self) -> None:
         """Start the children of the plan, or those that there were before."""
+        self._tell_begun()
         await self._start_listed()
+
+    def _tell_begun(self) -> None:
+        """Say which children there are or come back: whoever waits for another one hears that it does not."""
+        self.ctx._cell.node.ports.keeper.began(self.ctx.path, list(self._children))
 
     async def _start_listed(self) -> None:
         """Start the children that are listed."""

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from ..exit_reasons import ExitReason
     from ..overflow import Overflow
     from .actor import Start
-    from .cell import Cell, GivenName
+    from .cell import Cell, GivenName, Order
 
 
 class Work(NamedTuple):
@@ -191,6 +191,9 @@ class Place:
     def kill(self, cell: Cell) -> None:
         """End the life at once."""
         raise NotImplementedError
+
+    def require_order(self, cell: Cell, order: Order) -> None:
+        """Raises NotGranted: `stop` or `kill` would, for an actor may not give such an order there."""
 
     def control(self, cell: Cell, call: QueuedOrder) -> None:
         """Have an order carried out between two turns of the actor, ahead of all messages."""

@@ -36,6 +36,7 @@ from .codec import Codec
 from .deadlines import Deadlines
 from .envelope import Item
 from .lifecycle import LOCAL
+from .links import MADE_UP_NAME
 from .loop import RunLoop
 from .mailbox import Bound, Bounded, admit_bounded, admit_gone
 from .message import Refusal
@@ -174,7 +175,7 @@ class Numbers:
 
     def next_name(self) -> str:
         """A name for an actor that was given none."""
-        return f"${next(self._names)}"
+        return f"{MADE_UP_NAME}{next(self._names)}"
 
     def next_turn(self) -> int:
         """A number for a turn that asks."""

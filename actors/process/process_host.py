@@ -648,6 +648,8 @@ def _command(node: Node, worker: Worker, frame: frames.Command) -> None:
             data = frame.data
             bound, last = data.get("bindings", {}), unpack_exit(data["last"]) if "last" in data else KILLED
             worker.inner.born(cell, data["path"], data["kind"], data["life"], bound, last)
+            if data.get("anew"):
+                node.cell_at(data["path"]).extra().ties.is_anew = True
         case "gone":
             reason, with_parent = unpack_exit(frame.data.get("reason")), bool(frame.data.get("with_parent"))
             worker.inner.gone(frame.data["path"], reason, with_parent=with_parent)
@@ -693,6 +695,8 @@ def keep(worker: Worker, frame: frames.Command) -> None:
                 keeper.returned(path)
             case "dismissed":
                 keeper.dismissed(path, below=bool(data.get("below")), for_good=bool(data.get("for_good")))
+            case "began":
+                keeper.began(path, [str(name) for name in data.get("listed", ())])
             case "note":
                 above, _, name = path.rpartition("/")
                 keeper.note(child_key(above, name), data.get("value"))

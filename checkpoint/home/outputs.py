@@ -97,6 +97,8 @@ class Outputs:
                 home.ties.turn(turn, out.verb, out.to)
                 home.note(turn, ("tie", turn, out.verb, out.to), batch)
                 batch.after.append(lambda: connect(cell, node.cell_at(out.to), out.verb))
+            case "kill" | "stop" as order:
+                batch.after.append(lambda: node.cell_at(out.to).obey(order, home.path))
             case "pipe":
                 pass
             case verb:

@@ -25,6 +25,8 @@ BETWEEN = "tests/checkpoint/test_between_lives.py"
 ORDER = "tests/checkpoint/test_order.py"
 REGISTRY = "tests/supervision/test_registry_recorded.py"
 ORDERS = "tests/checkpoint/test_restart_orders.py"
+TO_THE_GONE = "tests/checkpoint/test_ties_to_the_gone.py"
+ONCE = "tests/checkpoint/test_orders_once.py"
 GIVEN_UP = "tests/checkpoint/test_given_up.py"
 WITHDRAWN = "tests/checkpoint/test_withdrawn.py"
 
@@ -49,6 +51,69 @@ CHECKS = {
         "        return key == input_of(worker.page[0])\n",
         WITHDRAWN,
         "was_not_heard_of and process",
+    ),
+    "a tie to somebody who does not come back is over": Check(
+        "checkpoint/durable_links.py",
+        "                if absent.is_gone(path):\n",
+        "                if False:\n",
+        TO_THE_GONE,
+        "told_of_once and made and house and task",
+    ),
+    "who waits hears of a supervisor that begins without the other one": Check(
+        "checkpoint/home/absent.py",
+        "            for ties in self._waiting.pop(path):\n                ties.end(path)\n",
+        "            self._waiting.pop(path)\n",
+        TO_THE_GONE,
+        "told_of_once and watcher and task",
+    ),
+    "a tie does not go over to whoever has the same id now": Check(
+        "checkpoint/durable_links.py",
+        "elif other is not others.get(path) and absent.is_another(other):",
+        "elif False:",
+        TO_THE_GONE,
+        "told_of_once and stranger and task",
+    ),
+    "who goes on with what is recorded is waited for": Check(
+        "checkpoint/home/absent.py",
+        "return name not in listed and not self._may_return(at)",
+        "return name not in listed",
+        TO_THE_GONE,
+        "may_come_back and keyed",
+    ),
+    "a child of a list that was not started yet is waited for": Check(
+        "checkpoint/home/absent.py",
+        "return name not in listed and not self._may_return(at)",
+        "return not self._may_return(at)",
+        TO_THE_GONE,
+        "may_come_back and listed",
+    ),
+    "a child that its supervisor has brought back is the same one": Check(
+        "checkpoint/home/absent.py",
+        "if is_anew(one) and (above is None or one.name not in self._listed.get(above.path, ())):",
+        "if is_anew(one):",
+        TO_THE_GONE,
+        "may_come_back and journaled and house",
+    ),
+    "a process says whose id is made up": Check(
+        "actors/process/process_host.py",
+        '                node.cell_at(data["path"]).extra().ties.is_anew = True\n',
+        "                pass\n",
+        TO_THE_GONE,
+        "told_of_once and stranger and made and process",
+    ),
+    "an order is an output of its turn": Check(
+        "checkpoint/life/recorded_context.py",
+        "            self.recorded.put(order, cell.path)\n",
+        "            super()._order(cell, order)\n",
+        ONCE,
+        "test_it_is_carried_out_once and task",
+    ),
+    "an order that nothing grants is refused where it is given": Check(
+        "checkpoint/life/recorded_context.py",
+        "                cell.require_order(order)\n",
+        "                pass\n",
+        ONCE,
+        "test_a_process_orders_those_alone",
     ),
     "a recorded holder is found when it lives again": Check(
         "checkpoint/home/switch.py",

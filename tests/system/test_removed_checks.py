@@ -65,9 +65,9 @@ CHECKS = {
         "stays_where_it_is and pbr-task",
     ),
     "who ends others is noted": Check(
-        "actors/kernel/ref.py",
-        "            note_order(caller._cell, self._cell)\n        self._cell.living.kill",
-        "            pass\n        self._cell.living.kill",
+        "actors/kernel/context.py",
+        "        note_order(self._cell, cell)\n        cell.obey(order, self.path)\n",
+        "        cell.obey(order, self.path)\n",
         GRANTS,
         "ended_others",
     ),
