@@ -3,7 +3,6 @@
 A new one is one class: derive from `Observer`, override `hear` or `look`, and call `verdict`.
 """
 
-from .binary import BinaryQualitativeObserver, Source
 from .diagnostic import Check, DiagnosticObserver
 from .flow import Baselines, FlowObserver
 from .general import GeneralObserver, Learned
@@ -12,12 +11,12 @@ from .multiple import ConditionedObserver, TriggeredObserver
 from .node_observer import NodeObserver
 from .observer import Look, Manner, Observer
 from .property import Bound, Property, PropertyObserver
-from .qualitative import QualitativeObserver, trend
 from .regression import Fit, Regression
 from .replicas import ReplicaObserver
 from .runtime import RuntimeObserver
 from .score import ScoreObserver
 from .timeout import TimeoutObserver
+from .trends import BinaryQualitativeObserver, QualitativeObserver, Source, trend
 from .verdicts import Agreement, Debounce, Limits, Median, Smooth
 
 __all__ = [
