@@ -368,9 +368,13 @@ class Hooked(msgspec.Struct, array_like=True, tag=21):
 
 
 class Live(msgspec.Struct, array_like=True, tag=13):
-    """`Go` was reached: the actor takes new inputs. `restore_seconds` is what putting the state back took."""
+    """`Go` was reached: the actor takes new inputs. `restore_seconds` is what putting the state back took.
+
+    `promises`: inputs whose asks it can answer later, for it was given, or has made, a handle; None: that is not known.
+    """
 
     restore_seconds: float
+    promises: list[int] | None = None
 
 
 class Shared(msgspec.Struct, array_like=True):

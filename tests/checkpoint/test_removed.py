@@ -28,6 +28,27 @@ ORDERS = "tests/checkpoint/test_restart_orders.py"
 GIVEN_UP = "tests/checkpoint/test_given_up.py"
 
 CHECKS = {
+    "what the next life has no handle for fails": Check(
+        "checkpoint/home/pending_asks.py",
+        "            self.later.pop(key).fail(AskFailed(self._home.path, FORGOTTEN))\n",
+        "            pass\n",
+        "tests/actors/test_owed.py",
+        "test_what_the_next_life and task and kill",
+    ),
+    "what the state that it begins with has a handle for is kept": Check(
+        "checkpoint/life/recorded_life.py",
+        "            self.restored.promises.add(handle.id)\n",
+        "            pass\n",
+        "tests/actors/test_owed.py",
+        "test_a_turn_hears_once",
+    ),
+    "what a replay makes a handle for is kept": Check(
+        "checkpoint/life/recorded_context.py",
+        "            self.recorded.restored.promises.add(feed.id)\n",
+        "            pass\n",
+        "tests/actors/test_owed.py",
+        "test_a_replay_makes",
+    ),
     "a recorded holder is found when it lives again": Check(
         "checkpoint/home/switch.py",
         "for come in self.node.awaited.pop(self.path, ()):",
