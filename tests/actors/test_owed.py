@@ -26,6 +26,9 @@ class End(hf.Message):
     how: str
 
 
+class Begin(hf.Message): ...
+
+
 class Came(hf.Message[list[str]]): ...
 
 
@@ -169,12 +172,7 @@ async def test_a_recorded_actor_keeps_its_promises_over_a_crash(system: hf.Actor
 class Forgetful(Promises):
     """Holds its handles where no snapshot keeps them."""
 
-    def __init__(self) -> None:
-        self._waiting: list[hf.ReplyHandle[str]] = []
-
-    @property
-    def waiting(self) -> list[hf.ReplyHandle[str]]:
-        return self._waiting
+    key_variables = ()
 
 
 class Asker(hf.Actor):
@@ -183,8 +181,8 @@ class Asker(hf.Actor):
     def __init__(self) -> None:
         self.came: list[str] = []
 
-    @hf.on(Question)
-    async def ask(self, message: Question) -> None:
+    @hf.on(Begin)
+    async def begin(self, message: Begin) -> None:
         try:
             self.came.append(await self.ctx.find("/t/top/a", Promises).ask(Question(), LONG))
         except hf.AskFailed as error:
@@ -252,7 +250,7 @@ async def test_a_turn_hears_once_that_nobody_will_answer_it_also_when_the_root_i
     async with hf.ActorSystem("t", store=store, log=False) as system:
         await system.start(top)
         promises, asker = system.ref("/t/top/a", kind), system.ref("/t/top/b", Asker)
-        asker.tell(Question())
+        asker.tell(Begin())
         while await promises.ask(Count(), LONG) == 0:
             await asyncio.sleep(0)
         await system.checkpoint(promises)

@@ -1010,8 +1010,8 @@ CHECKS = {
     ),
     "a state that comes back has refs, not what was saved of them": Check(
         "checkpoint/snapshot/key_variables.py",
-        "partial(read, refs=actor.ctx._cell.node.ref_at)",
-        "read",
+        "partial(read, refs=actor.ctx._cell.node.ref_at, handles=handles)",
+        "partial(read, handles=handles)",
         "tests/checkpoint/test_kept_refs.py",
         "test_they_are_refs_again_in_the_next_life",
     ),

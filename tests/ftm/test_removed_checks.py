@@ -517,7 +517,7 @@ CHECKS = {
     ),
     "who alone has the state is not killed on suspicion": Check(
         "ftm/group/membership.py",
-        "        return is_alive and not self.backups(lives) and not is_hopeless\n",
+        "        return not self.suspected[name].is_barred and now - self.suspected[name].since < hopeless\n",
         "        return False\n",
         FAILOVER,
         "test_a_silent_primary_that_nobody",

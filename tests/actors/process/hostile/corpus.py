@@ -76,7 +76,7 @@ class Listener:
                 self._hear(connection)
             take_frames(connection, left)
 
-        Connection._take_frames = listening  # type: ignore[method-assign]
+        Connection._take_frames = listening  # type: ignore[method-assign, assignment]
 
     def _hear(self, connection: Connection) -> None:
         buffer, worker = connection._buffer, connection._on_frame.__self__  # type: ignore[attr-defined]
