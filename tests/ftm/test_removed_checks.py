@@ -18,6 +18,20 @@ FAILOVER, CHECKS_ALONE = "tests/ftm/test_failover.py", "tests/ftm/test_checks.py
 AUTHORS = "tests/ftm/test_author_bricks.py"
 REVOKED, LINKS = "tests/ftm/test_revoked_replicas.py", "tests/ftm/sec/test_link.py"
 CHECKS = {
+    "an answer that is in hand when the backup is lost is told of": Check(
+        "ftm/mechanisms/pbr.py",
+        "            if standing.other.path is None:  # It was lost with this in hand.\n",
+        "            if False:\n",
+        PBR,
+        "goes_on_alone_and_says_so",
+    ),
+    "and when the follower is": Check(
+        "ftm/mechanisms/lfr.py",
+        "        if standing.other.path is None:  # It was lost with this in hand.\n",
+        "        if False:\n",
+        PBR,
+        "goes_on_alone_and_says_so",
+    ),
     "a replica that is revoked is lost at once": Check(
         "ftm/sec/link.py",
         """            self._distrust(path, f"its certificate is not accepted ({REVOKED})")\n""",
