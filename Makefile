@@ -25,7 +25,7 @@ test: $(VENV)/.dev
 # with other random examples each time, all combinations of its parameters and fork servers started by exec, all tests on
 # each other version of Python, and mutants. See docs/campaigns.md.
 campaign: $(VENV)/.dev
-	HOLDFAST_RANDOM=1 HOLDFAST_LOOPS=both HOLDFAST_CROSSED=1 HOLDFAST_COLD=1 $(MAKE) --no-print-directory test
+	HOLDFAST_RANDOM=1 HOLDFAST_LOOPS=both HOLDFAST_CROSSED=1 HOLDFAST_COLD=1 HOLDFAST_CORPUS=1 $(MAKE) --no-print-directory test
 	$(foreach python,$(shell .ci/pythons),HOLDFAST_RANDOM=1 $(MAKE) --no-print-directory test \
 	    PYTHON=$(python) VENV=.venv-$(notdir $(python)) &&) true
 	HOLDFAST_KILLS=10000 HOLDFAST_CUTS=5000 HOLDFAST_BETWEEN=2000 HOLDFAST_ORDER=200 HOLDFAST_REMOVED=1 $(BIN)/python -m pytest -q -n 2 -s \

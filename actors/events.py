@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import functools
+import math
 import typing
 from collections import deque
 from collections.abc import AsyncIterator, Callable
@@ -745,8 +746,14 @@ def _kinds(event: type[Event]) -> dict[str, Any]:
 
 
 def _fits(event: Event) -> bool:
-    """Whether the fields of an event that another process told are what they have to be."""
-    return all(isinstance(getattr(event, name), kind) for name, kind in _kinds(type(event)).items())
+    """Whether the fields of an event that another process told are what they have to be, and numbers finite."""
+    values = ((getattr(event, name), kind) for name, kind in _kinds(type(event)).items())
+    return all(isinstance(value, kind) and not is_endless(value) for value, kind in values)
+
+
+def is_endless(value: object) -> bool:
+    """Whether this is a number that is infinite, or none (NaN)."""
+    return isinstance(value, float) and not math.isfinite(value)
 
 
 def event_data(event: Event) -> dict[str, Any]:

@@ -8,9 +8,10 @@ What there is many of is not seen by the garbage collector (`gc=False`): nothing
 
 from __future__ import annotations
 
+import sys
 import zlib
 from collections.abc import Iterator
-from typing import Any
+from typing import Annotated, Any, TypeAlias
 
 import msgspec
 
@@ -40,6 +41,10 @@ GIVEN_UP = "given up"
 SINCE_THEN = "since then"
 
 
+Finite: TypeAlias = Annotated[float, msgspec.Meta(ge=-sys.float_info.max, le=sys.float_info.max)]
+"""A number of seconds as a process may say it: neither infinite nor no number at all."""
+
+
 class Out(msgspec.Struct, array_like=True, gc=False):
     """One output of a turn; `k` counts them in program order from 1. `trace` is that of its turn, and no part of it."""
 
@@ -48,8 +53,8 @@ class Out(msgspec.Struct, array_like=True, gc=False):
     to: str
     name: str = ""
     body: bytes = b""
-    seconds: float = 0.0
-    interval: float = 0.0
+    seconds: Finite = 0.0
+    interval: Finite = 0.0
     trace: str = ""
 
     def digest(self) -> int:
@@ -129,7 +134,7 @@ def answer_digest(answer: Answer) -> int:
     return zlib.crc32(answer.body, zlib.crc32(f"{answer.kind}|{answer.name}".encode())) or 1
 
 
-Clock = tuple[str, bytes, float]
+Clock = tuple[str, bytes, Finite]
 """What a timer says: type name and body of its message, and its interval (0: it comes once)."""
 
 
@@ -368,9 +373,13 @@ class Hooked(msgspec.Struct, array_like=True, tag=21):
 
 
 class Live(msgspec.Struct, array_like=True, tag=13):
-    """`Go` was reached: the actor takes new inputs. `restore_seconds` is what putting the state back took."""
+    """`Go` was reached: the actor takes new inputs. `restore_seconds` is what putting the state back took.
 
-    restore_seconds: float
+    `promises`: inputs whose asks it can answer later, for it was given, or has made, a handle; None: that is not known.
+    """
+
+    restore_seconds: Finite
+    promises: list[int] | None = None
 
 
 class Shared(msgspec.Struct, array_like=True):
@@ -400,7 +409,7 @@ class Snapshot(msgspec.Struct, array_like=True, tag=14):
     data: bytes
     is_last: bool
     stash: list[int]
-    pause: float
+    pause: Finite
     is_replaced: bool = False
     image: Shared | None = None
     traps: bool = False  # `ctx.trap_exits`

@@ -26,6 +26,7 @@ from collections import defaultdict
 from collections.abc import AsyncIterator, Iterator
 from importlib.metadata import entry_points
 from pathlib import Path
+from typing import Any
 
 import hypothesis
 import psutil
@@ -103,6 +104,9 @@ UNDER_BOTH = Path(__file__).parent / "actors"  # but not the folders in it
 # Inherited by every process that a test starts, so that orphans are found: they are nobody's children any more.
 MARK = "HOLDFAST_TEST_RUN"
 
+LISTENER: pytest.StashKey[Any] = pytest.StashKey()
+"""What hears the frames of this run (`tests/actors/process/hostile/corpus.py`)."""
+
 
 @pytest.hookimpl(tryfirst=True)  # Before Hypothesis looks at its option.
 def pytest_configure(config: pytest.Config) -> None:
@@ -110,6 +114,10 @@ def pytest_configure(config: pytest.Config) -> None:
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         # A shell that started us with & has it ignored, and so would have each program that a test interrupts.
         signal.signal(signal.SIGINT, signal.default_int_handler)
+    if "HOLDFAST_CORPUS" in os.environ:
+        from tests.actors.process.hostile.corpus import Listener
+
+        config.stash[LISTENER] = Listener()
     config.addinivalue_line("markers", "pairs: each pair of values of two parameters is enough (tests/pairs.py)")
     if RANDOM == "1":
         os.environ["HOLDFAST_RANDOM"] = str(random.SystemRandom().randrange(2, 2**32))
@@ -117,6 +125,13 @@ def pytest_configure(config: pytest.Config) -> None:
         config.option.loadscopereorder = False  # The order is that of `_longest_first`.
     if RANDOM and config.getoption("hypothesis_seed") is None:
         config.option.hypothesis_seed = os.environ["HOLDFAST_RANDOM"]
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Keep the frames that were new, if that is wanted."""
+    listener = session.config.stash.get(LISTENER, None)
+    if listener is not None:
+        listener.save()
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

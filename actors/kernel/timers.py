@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Any
 
+from ..seconds import check_seconds
 from .envelope import Chain, Item
 from .message import Message
 
@@ -89,6 +90,8 @@ class LoopTimer(Timer):
         cls, cell: Cell, message: Message[Any], left: float | None, interval: float | None, queued: bool
     ) -> LoopTimer:
         """Make the timer of an actor that has been moved here again, from its data."""
+        left = None if left is None else check_seconds(cell.path, "delay", left, or_zero=True)
+        interval = None if interval is None else check_seconds(cell.path, "interval", interval)
         timer = cls(cell, message, left or 0.0, interval)
         timer.pause()
         if left is None:

@@ -6,6 +6,7 @@ left on its way is void.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, cast
 
@@ -39,6 +40,18 @@ def say(connection: Connection, path: str, attempt: int, step: str, **told: Any)
     for at in range(0, len(data), PIECE):
         part, is_last = data[at : at + PIECE], at + PIECE >= len(data)
         connection.send(frames.Migrate(connection.names.to_wire(path), attempt, step, part, is_last), path)
+
+
+def moment(told: dict[str, Any]) -> float:
+    """When it was, as it was told.
+
+    Raises:
+        BadFrame: that is no time.
+    """
+    at = told["at"]
+    if not isinstance(at, int | float) or not math.isfinite(at):
+        raise BadFrame(f"a moment of a migration that is no time ({at!r})")
+    return float(at)
 
 
 class Incoming:

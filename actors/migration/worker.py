@@ -20,6 +20,7 @@ from .here import let_in
 from .luggage import let_come, unpack, unpack_items
 from .move import Entering, Leaving
 from .quiesce import carry, now, sorted_out
+from .words import moment
 
 if TYPE_CHECKING:
     from ..kernel.actor import Actor
@@ -61,7 +62,7 @@ class ToWorker(Entering):
 
     def _heard(self, step: str, told: dict[str, Any]) -> None:
         if step == "began" and not self._began.done():
-            self._began.set_result(float(told["at"]))
+            self._began.set_result(moment(told))
 
     def owe(self, ask: Ask) -> int:
         assert self.worker is not None
@@ -157,7 +158,7 @@ class FromOwnWorker(Leaving):
             case "taken" if self.worker.is_killed:
                 move.give_up("it is killed")
             case "taken" if not move.given_up.done():
-                move.rest_at = float(told["at"])
+                move.rest_at = moment(told)
                 move.luggage.traps, move.luggage.suspended = bool(told["trap_exits"]), bool(told["suspended"])
                 move.at_rest()
                 self.worker.on_death(self.died)

@@ -21,7 +21,7 @@ from ..errors import DamagedValue, UnsavableValue
 from .budget import LargeInts, TooMany, check_containers
 from .byte_parts import ByteParts, in_one
 from .forms import FORMAT, LENGTH
-from .saved_refs import SavedRef
+from .saved_refs import SavedHandle, SavedRef
 from .value_describer import Describer, ValueDescription
 from .value_reader import Decoder, unpack
 from .value_writer import ALONE, HEAD_ALONE, Links, pieces, scalar_bytes, walked_pieces
@@ -95,6 +95,7 @@ def decode_value(
     imports: bool = True,
     shared: dict[int, object] | None = None,
     refs: Callable[[str], object] = SavedRef,
+    handles: Callable[[SavedHandle], None] = SavedHandle.nobody,
 ) -> object:
     """Read what `encode_value` wrote. Arrays are writable and own their memory.
 
@@ -107,6 +108,7 @@ def decode_value(
             made than `MOST_CONTAINERS`.
         shared: what values that were written before it share with it (`Links`); what is read is added.
         refs: gives the ref of an address (`Node.ref_at`); left out, a `SavedRef` stands for it, which cannot send.
+        handles: told each handle that is read.
 
     Raises:
         DamagedValue: whatever is wrong with the bytes.
@@ -118,7 +120,9 @@ def decode_value(
     holdfast.actors.errors.DamagedValue: a saved value cannot be read: it is cut short; use an older snapshot
     """
     return _read(
-        data, lambda buffers: Decoder(buffers, imports=imports, shared=shared, refs=refs), is_checked=not imports
+        data,
+        lambda buffers: Decoder(buffers, imports=imports, shared=shared, refs=refs, handles=handles),
+        is_checked=not imports,
     )
 
 
@@ -127,16 +131,19 @@ def adopt_value(
     *,
     shared: dict[int, object] | None = None,
     refs: Callable[[str], object] = SavedRef,
+    handles: Callable[[SavedHandle], None] = SavedHandle.nobody,
 ) -> object:
     """Read what `encode_value` wrote into memory that is the reader's own: large arrays stay where they lie in it.
 
     Such an array is writable and keeps the memory alive; but it does not own it, so that it cannot be resized in place.
-    `shared` and `refs` are as for `decode_value`.
+    `shared`, `refs` and `handles` are as for `decode_value`.
 
     Raises:
         DamagedValue: whatever is wrong with the bytes.
     """
-    return _read(data, lambda buffers: Decoder(buffers, adopts=True, shared=shared, refs=refs), is_checked=False)
+    return _read(
+        data, lambda buffers: Decoder(buffers, adopts=True, shared=shared, refs=refs, handles=handles), is_checked=False
+    )
 
 
 def describe_value(data: bytes | memoryview, *, shared: dict[int, object] | None = None) -> object:

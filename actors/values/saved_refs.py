@@ -19,6 +19,10 @@ class SavedHandle:
 
     __slots__ = ()
 
+    @staticmethod
+    def nobody(handle: SavedHandle) -> None:
+        """Stands for whoever wants to know of the handles that are read."""
+
 
 class SavedRef(Addressed):
     """Stands for a ref where values are read that no actor gets: nothing can be sent by it. Equal if the address is."""

@@ -32,7 +32,7 @@ from .forms import (
     Make,
     pairs,
 )
-from .saved_refs import SavedRef
+from .saved_refs import SavedHandle, SavedRef
 
 
 def _make_tuples(rows: list[Any]) -> list[Any]:
@@ -82,8 +82,9 @@ class Decoder:
         adopts: bool = False,
         shared: dict[int, object] | None = None,
         refs: Callable[[str], object] = SavedRef,
+        handles: Callable[[SavedHandle], None] = SavedHandle.nobody,
     ) -> None:
-        self._imports, self._make_int, self._refs = imports, LargeInts().make, refs
+        self._imports, self._make_int, self._refs, self._handles = imports, LargeInts().make, refs, handles
         self.buffers = buffers  # those not yet read: they lie in the order in which the tree names them
         self.open_marks = 0
         self.shared: dict[int, object] = {} if shared is None else shared
@@ -188,4 +189,6 @@ class Decoder:
             if not hasattr(made, "__dict__"):
                 raise DamagedValue(f"class {name} has no {', '.join(attributes)}")
             made.__dict__.update(attributes)
+        if isinstance(made, SavedHandle):
+            self._handles(made)
         return made

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from ...actors.errors import AskTimeout, BadMessage, BadReply, EffectInDoubt, HoldfastError, type_name
+from ...actors.errors import AskFailed, AskTimeout, BadMessage, BadReply, EffectInDoubt, HoldfastError, type_name
 from ...actors.events import EffectRepeated
 from ...actors.kernel.cell import Cell, TurnRest
 from ...actors.kernel.codec import Parcel
@@ -45,6 +45,7 @@ ACCEPTED = Came(REPLY, "", msgspec.msgpack.encode(None))
 
 SHORT = 0.05
 """Seconds that asks which change nothing wait for an effect: one that is out for longer keeps them waiting no more."""
+FORGOTTEN = "the life that has promised the reply has ended, and the handle was in nothing that the next one has"
 MARK = "ask "
 """How the origin of an input begins that somebody's recorded turn has asked; the asker is its sender."""
 
@@ -215,6 +216,13 @@ class PendingCalls:
         for key, ask in list(self.later.items()):
             if turned_away(ask, error, keep_asks=keep_asks):
                 del self.later[key]
+
+    def keep_promises(self, kept: list[int] | None) -> None:
+        """A life has come up that can answer these later, and no others: who waits for another one hears so."""
+        if kept is None:
+            return
+        for key in self.later.keys() - set(kept):
+            self.later.pop(key).fail(AskFailed(self._home.path, FORGOTTEN))
 
     # -- what is waited for -----------------------------------------------------------------------------------------
 

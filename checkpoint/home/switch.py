@@ -460,6 +460,7 @@ class Switch:
                 case Snapshot():
                     self.arrival.take(record)
                 case Live():
+                    self.calls.keep_promises(record.promises)
                     life.come_up(record.restore_seconds)
                     self.images.mapped()
                     if life.port is not None and life.port.is_far:

@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from .outcome_order import OutcomeOrder
 
 
+MOST_PROMISES = 100_000
+
+
 class Asked(NamedTuple):
     """Whose reply to what a turn waits for."""
 
@@ -43,6 +46,7 @@ class RestoredState:
         stash_ids: inputs that had been put aside.
         unstashes: whether those are to come again.
         seconds: how long it took to put the state back.
+        promises: inputs that it has been given, or has made, the handle of a later reply for, until it is live.
     """
 
     pieces: list[bytes] = dataclasses.field(default_factory=list)
@@ -54,6 +58,12 @@ class RestoredState:
     stash_ids: frozenset[int] = frozenset()
     unstashes: bool = False
     seconds: float = 0.0
+    promises: set[int] = dataclasses.field(default_factory=set)
+
+    def take_promises(self) -> list[int] | None:
+        """Give up what it can answer later; None if that is too much to say."""
+        promises, self.promises = self.promises, set()
+        return sorted(promises) if len(promises) <= MOST_PROMISES else None
 
     def take(self, record: Restore) -> None:
         """Take one more piece of the state."""

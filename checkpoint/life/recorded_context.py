@@ -333,7 +333,11 @@ class RecordedContext(ActorContext):
 
     def reply_handle(self) -> ReplyHandle[Any]:
         feed = self.recorded.feed  # Its id even if nobody waits (any more): a replay must make the same handle.
-        return RecordedReplyHandle(feed.id if feed is not None else -1)
+        if feed is None:
+            return RecordedReplyHandle(-1)
+        if not self.recorded.is_live:
+            self.recorded.restored.promises.add(feed.id)
+        return RecordedReplyHandle(feed.id)
 
     async def publish(self, topic: str, message: Message[Any]) -> None:
         if not self._in_turn():

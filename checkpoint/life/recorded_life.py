@@ -77,12 +77,13 @@ from .glances import answer_beside
 from .life_state import Asked, Awaited, LifeStage, LifeTimers, LifeWaits, RestoredState, SnapshotState
 from .outcome_order import OutcomeOrder, is_given_up
 from .readonly_guard import check_readonly
-from .recorded_context import Pending, RecordedContext
+from .recorded_context import Pending, RecordedContext, RecordedReplyHandle
 from .recorded_inbox import INIT, STOP, Fed, GoLive, Hook, StopRecorded, TakeSnapshot
 from .replay_guard import digest_of
 
 if TYPE_CHECKING:
     from ...actors.kernel.loop import Suspended
+    from ...actors.values.saved_refs import SavedHandle
     from ..inputs import Input
 
 NOT_SAVED: Final = -2
@@ -166,7 +167,9 @@ class Life:
             try:
                 data = self.images.mapped(restored.image) if restored.image is not None else restored.joined()
                 self.images.last_bytes = len(data)
-                dropped, restored.is_mapped = restore_state(actor, data, (restored.variables, self.saving.variables))
+                dropped, restored.is_mapped = restore_state(
+                    actor, data, (restored.variables, self.saving.variables), handles=self._take_handle
+                )
             except BaseException as error:
                 why = UNFIT if isinstance(error, StateMismatch) else "its state could not be restored"
                 self._give_up(f"{why}: {error}", error)
@@ -516,6 +519,10 @@ class Life:
             self.port.to_home(Released(self.turn, feed.id, self.outs))
             self.outs = []
 
+    def _take_handle(self, handle: SavedHandle) -> None:
+        if isinstance(handle, RecordedReplyHandle):
+            self.restored.promises.add(handle.id)
+
     # -- snapshots --------------------------------------------------------------------------------------------------
 
     def go_live(self, gone: tuple[int, ...]) -> None:
@@ -529,7 +536,7 @@ class Life:
             self.handle_returned()
         if stage.begins_suspended:  # Behind what comes first: it is not handled either.
             mailbox.suspend(self.cell)
-        self.port.to_home(Live(self.restored.seconds))
+        self.port.to_home(Live(self.restored.seconds, self.restored.take_promises()))
         if self.saving.is_due:
             self.want_snapshot()
         elif stage.has_replayed and self.method.snapshots:  # A crash loop must not replay the same turns for ever.

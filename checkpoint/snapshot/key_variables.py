@@ -12,6 +12,7 @@ from ...actors.errors import type_name
 from ...actors.kernel.actor import Actor
 from ...actors.state_hooks import StateMismatch, as_named_now, migrated, state_getter, state_setter
 from ...actors.values import ByteParts, UnsavableValue, adopt_value, decode_value, encode_value
+from ...actors.values.saved_refs import SavedHandle
 from ..method import Method
 from .state_image import read_saved
 
@@ -94,6 +95,7 @@ def restore_state(
     data: bytes | ByteParts,
     variables: tuple[list[str], list[str]] = ([], []),
     meant: Callable[[Any], Any] = as_it_is,
+    handles: Callable[[SavedHandle], None] = SavedHandle.nobody,
 ) -> StatePutBack:
     """Put a saved state back; one of an older schema is handed to the class's `migrate` first.
 
@@ -102,12 +104,13 @@ def restore_state(
         data: the state; parts are in memory that becomes the actor's own.
         variables: those that the class had that has saved it, and that it has now, after `__init__` alone.
         meant: gives what is meant by a saved value.
+        handles: told each handle in the state.
 
     Raises:
         DamagedValue, StateMismatch: the data is damaged, or of another class or schema version.
     """
     read = adopt_value if isinstance(data, ByteParts) else decode_value
-    saved: Any = read_saved(data, partial(read, refs=actor.ctx._cell.node.ref_at))
+    saved: Any = read_saved(data, partial(read, refs=actor.ctx._cell.node.ref_at, handles=handles))
     dropped: list[str] = []
     is_mapped = isinstance(saved, tuple) and len(saved) == 3 and saved[0] != actor.schema_version
     if isinstance(saved, tuple) and len(saved) == 3 and saved[:2] == (actor.schema_version, "keys"):

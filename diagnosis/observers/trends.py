@@ -1,4 +1,4 @@
-"""The trend of a value, `inc(v)`, `dec(v)` or `const(v)` (D22), and two that should be alike: `matched(v1,v2)` (D23)."""
+"""Trends of values: `inc(v)`, `dec(v)` or `const(v)` (D22), and whether two are alike: `matched(v1,v2)` (D23)."""
 
 from __future__ import annotations
 

@@ -196,6 +196,10 @@ class SecuredLink(Protocol):
         """Go on at another address of the protected actor, under the names that are certified there."""
         ...
 
+    def begins_life(self, path: str) -> None:
+        """Whoever lives there now is another than before. For the root's end."""
+        ...
+
     def close(self) -> None:
         """Nothing is sent or accepted any more."""
         ...

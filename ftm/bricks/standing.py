@@ -206,7 +206,7 @@ class Standing:
         begins with the same.
         """
         inside = (self.inside[number] for number in numbers if number in self.inside)
-        if self.other.is_missed and any(one.feed.kind != START for one in inside):
+        if self.other.is_missed and not self.is_fenced and any(one.feed.kind != START for one in inside):
             self.other.is_missed = False
             self.node.emit(ProtectionLost(self.address, self.path, self.epoch))
 

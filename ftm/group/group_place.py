@@ -441,7 +441,7 @@ class GroupPlace(Place):
 
     def life_is_up(self, group: Group, live: Live) -> None:
         """The life has caught up."""
-        group.switch.from_life(live)
+        group.switch.from_life(msgspec.structs.replace(live, promises=None))  # Replicas get states in other ways, too.
 
     def start_failed(self, group: Group, end: TurnEnd) -> None:
         """The actor could not be started."""

@@ -38,6 +38,7 @@ class Suspicion(NamedTuple):
     why: str
     since: float  # on the loop's clock
     is_silence: bool = False  # nothing else is wrong with it: a sign of life clears it
+    is_barred: bool = False  # nothing can be heard from it any more: there is nothing to wait for
 
 
 class FailoverStep(NamedTuple):
@@ -113,8 +114,9 @@ class Membership:
         """Whether a member that is suspected, and may yet be heard of again, is all there is."""
         life = self.members.get(name, 0)
         is_alive = life > 0 and lives.get(name, 0) == life
-        is_hopeless = not self.is_suspect(name, life) or now - self.suspected[name].since >= hopeless
-        return is_alive and not self.backups(lives) and not is_hopeless
+        if not is_alive or self.backups(lives) or not self.is_suspect(name, life):
+            return False
+        return not self.suspected[name].is_barred and now - self.suspected[name].since < hopeless
 
     def is_whole(self, lives: Lives) -> bool:
         """Whether one replica leads, and all others could."""

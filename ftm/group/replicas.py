@@ -175,6 +175,7 @@ class Replicas:
             self.place("proxy"),
             lambda: self.membership.epoch,
             lambda: [self.place(one) for one in names()],
+            lambda path, why: self.distrust(path.rpartition("/")[2], why),
         )
 
     def is_plain(self) -> bool:
@@ -280,6 +281,8 @@ class Replicas:
         """Take down a sign of life; True if it is the first one of this life."""
         match self.membership.hear(name, life):
             case "new":
+                if self.link is not None:
+                    self.link.begins_life(self.place(name))
                 self.watch(name)
                 self.wake()
                 return True
@@ -307,6 +310,15 @@ class Replicas:
         """A replica must be replaced; unless it is silent and nothing else, no sign of life changes that."""
         self.membership.suspect(name, Suspicion(life, why, self.node.loop.time(), is_silence), time.monotonic())
         self.wake()
+
+    def distrust(self, name: str, why: str) -> None:
+        """Nothing can be exchanged with a replica any more: it must be replaced, even if it is all there is."""
+        known = self.membership
+        life = known.members.get(name, 0) or known.up.get(name, 0)
+        if life and not known.is_over and not known.is_suspect(name, life):
+            known.suspect(name, Suspicion(life, why, self.node.loop.time(), is_barred=True), time.monotonic())
+            self.stir()
+            self.wake()
 
     def at_fault(self, name: str, why: str) -> None:
         """A replica has ended by what its own code has done, or looks as if it had."""

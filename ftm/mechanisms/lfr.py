@@ -185,6 +185,8 @@ class Notifying(After, Sender):
         if standing.other.state == "live":
             for task in list(standing.other.forwarded):
                 await task
+        if standing.other.path is None:  # It was lost with this in hand.
+            standing.go_on_alone(end.id for end in done.ends)
         standing.other.forwarded = [task for task in standing.other.forwarded if not task.done()]
         digests = [(end.id, end.turn, digest(end)) for end in done.ends]
         self.send_peer(Notify(digests, standing.looking.take(standing.server, done)))

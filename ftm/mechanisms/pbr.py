@@ -62,6 +62,8 @@ class Checkpointing(After):
             self._send(checkpoint, said, state)  # It does not count yet: what it has not got does not hold up anybody.
         elif self.mechanism.acknowledge:
             await self._hand_over(checkpoint, said, state)
+            if standing.other.path is None:  # It was lost with this in hand.
+                standing.go_on_alone(end.id for end in done.ends)
         else:
             while len(self._out) >= self.mechanism.window:
                 await asyncio.wait(self._out, return_when=asyncio.FIRST_COMPLETED)

@@ -273,12 +273,13 @@ class SEC(Mechanism):
         path: str,
         epoch: Callable[[], int],
         enrols: Callable[[], list[str]] | None = None,
+        distrusts: Callable[[str, str], None] | None = None,
     ) -> SecuredLink:
         """Open this participant's end of its links."""
         from ..sec.link import Link
         from ..sec.participants import LinkEnd
 
-        return Link(LinkEnd(node, address, path, self, epoch, enrols))
+        return Link(LinkEnd(node, address, path, self, epoch, enrols, distrusts))
 
 
 __all__ = ["SEC", "LinkLost", "Opening", "Sealing"]

@@ -23,6 +23,7 @@ from ...actors.kernel.message import message_name
 from ...actors.migration.luggage import let_come
 from ...actors.migration.move import Entering, Leaving, Move
 from ...actors.migration.quiesce import now
+from ...actors.migration.words import moment
 from ...actors.migration.worker import BUSY, ToWorker
 from ...actors.overflow import Overflow
 from ...actors.process.resource_limits import limits_data
@@ -156,7 +157,7 @@ class FromRecordedSubtree(Leaving):
             move.give_up(str(told["why"]))
         elif step == "taken" and not move.given_up.done():
             assert self._parent.home.switch is not None
-            move.rest_at = float(told["at"])
+            move.rest_at = moment(told)
             move.luggage.suspended, move.luggage.traps = bool(told["suspended"]), bool(told["trap_exits"])
             self._home = Detached(self._parent.home.switch)
             move.at_rest()
@@ -229,7 +230,7 @@ class FromSubtree(Leaving):
 
     def _has_come_to_rest(self, told: dict[str, Any]) -> None:
         cell, move, luggage = self.cell, self.move, self.move.luggage
-        move.rest_at, luggage.rest, luggage.data = float(told["at"]), told["rest"], told["state"]
+        move.rest_at, luggage.rest, luggage.data = moment(told), told["rest"], told["state"]
         luggage.state = luggage.data
         luggage.suspended, luggage.traps = bool(luggage.rest["suspended"]), bool(luggage.rest["trap_exits"])
         luggage.stash = unpack(self._worker, cell, told["stash"])

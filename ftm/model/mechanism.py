@@ -152,8 +152,13 @@ class Mechanism(MechanismDeclaration, Described):
         path: str,
         epoch: Callable[[], int],
         enrols: Callable[[], list[str]] | None = None,
+        distrusts: Callable[[str, str], None] | None = None,
     ) -> SecuredLink | None:
-        """Open the end of the links that is at `path`, for a mechanism that secures them (`layer` "link")."""
+        """Open the end of the links that is at `path`, for a mechanism that secures them (`layer` "link").
+
+        The root's end is told of whom it orders certificates (`enrols`), and tells of whom nothing can be believed any
+        more, and why (`distrusts`).
+        """
         return None
 
     def for_replicas(self) -> Self:

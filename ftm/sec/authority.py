@@ -22,7 +22,7 @@ from .certificates import (
     read_request,
 )
 from .keys import SigningKey, raw_public
-from .sec_errors import EnrolmentRefused, NoCertificate, Rejected
+from .sec_errors import EnrolmentRefused, KeyRevoked, NoCertificate, Rejected
 
 
 class GetRoot(Message[bytes]):
@@ -124,10 +124,17 @@ class CertificationAuthority(Actor):
             raise EnrolmentRefused(name, "it is not among the names that certificates are issued for")
         if any(key != public for _, key, _ in self._valid(name)):
             raise EnrolmentRefused(name, "the name belongs to another key; revoke that one first")
+        if self._is_key_revoked(name, public):
+            raise KeyRevoked(name, "its key was revoked; make another one")
         self._forget_old(name)
         certificate = issue(self._key, self.root, name, public, self.ctx.now(), self._lifetime)
         self.issued.setdefault(name, []).append((about(certificate)[0], public, certificate))
         return certificate
+
+    def _is_key_revoked(self, name: str, public: bytes) -> bool:
+        if any(key == public for _, key, _ in self._valid(name)):
+            return False
+        return any(key == public and serial in self.revoked for serial, key, _ in self.issued.get(name, []))
 
     def _valid(self, name: str) -> list[tuple[int, bytes, bytes]]:
         now = self.ctx.now()

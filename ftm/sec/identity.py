@@ -13,17 +13,14 @@ from typing import Any
 from ...actors.errors import HoldfastError
 from ...actors.kernel.message import Message
 from ..bricks.sealed_frames import FrameRefused
-from .authority import Enrol, GetCertificate, GetRevocations, GetRoot, Revoke
-from .certificates import Trust, about, make_request, public_of
+from .authority import GetCertificate, GetRevocations, GetRoot, Revoke
+from .certificates import Trust, about, public_of
 from .handshake import Participant
 from .keys import Secret, SigningKey, raw_public, read_own, write_own
 from .moved_certificates import CertifiedMove
-from .participants import LinkEnd, ask_authority, certified, key_file
+from .participants import AUTHORITY_WITHIN, LinkEnd, ask_authority, certified, key_file, order_certificate
 from .sec_errors import UNTRUSTED, EnrolmentRefused, NoCertificate, Rejected, UnsafeKeyFile
 from .session import SessionLimits
-
-AUTHORITY_WITHIN = 5.0
-"""Seconds in which the authority has to answer."""
 
 
 def root_file(folder: str, authority: str) -> Path:
@@ -42,7 +39,7 @@ class Identity(Secret):
         self.rejected: Counter[str] = Counter()
         self._me: Participant | None = None
         self._lock = asyncio.Lock()
-        self._enrolled: set[str] = set()  # by address
+        self._enrolled: dict[str, int] = {}  # by address: the serial number, as far as it is known
 
     async def ready(self) -> None:
         """Get all certificates.
@@ -81,6 +78,8 @@ class Identity(Secret):
             self._check_root(root)
         key = SigningKey.from_file(key_file(settings.folder, self.path))
         certificate = await self._authority(GetCertificate(certified(self.path)))
+        if public_of(certificate) != raw_public(key.public):
+            raise NoCertificate(certified(self.path))  # It is of another key than the one that is here.
         limits = SessionLimits(settings.rotate_messages, settings.rotate_seconds, lifetime=settings.lifetime)
         trust = Trust(root, needs_list=True)  # Who cannot know whether somebody was revoked believes nobody.
         trust.take_list(await self._authority(GetRevocations()), time.time())
@@ -106,25 +105,24 @@ class Identity(Secret):
         return about(certificate)[1] - time.time() < self.mechanism.renew_days * 86400.0
 
     async def _enrol(self, path: str) -> None:
-        """Order a certificate; once, and when its time is nearly over: one that was revoked stays so."""
+        """Order a certificate; once, and when its time is nearly over: who was revoked needs a new life first."""
         name, key = certified(path), SigningKey.from_file(key_file(self.mechanism.folder, path))
         try:
             certificate = await self._authority(GetCertificate(name))
             if public_of(certificate) == raw_public(key.public) and not self._is_due(certificate):
-                self._enrolled.add(path)
+                self._enrolled[path] = about(certificate)[0]
                 return
         except NoCertificate:
             if path in self._enrolled:
                 return
-        request = make_request(key, name)
         try:
-            await self._authority(Enrol(request))
+            certificate = await order_certificate(self._node, self.mechanism, path, name)
         except EnrolmentRefused:
             if not self.mechanism.is_per_start or path in self._enrolled:
                 raise
             await self._authority(Revoke(name))  # It was that of an earlier start.
-            await self._authority(Enrol(request))
-        self._enrolled.add(path)
+            certificate = await order_certificate(self._node, self.mechanism, path, name)
+        self._enrolled[path] = about(certificate)[0]
 
     async def _authority(self, message: Message[Any], within: float = AUTHORITY_WITHIN) -> Any:
         return await ask_authority(self._node, self.mechanism.authority, message, within)

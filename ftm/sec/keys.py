@@ -71,6 +71,16 @@ class SigningKey(Secret):
         _write_new(file, Ed25519PrivateKey.generate())
         return cls(_read(file))  # Maybe another process was faster: then the key is that one's.
 
+    @classmethod
+    def renewed(cls, path: str | os.PathLike[str]) -> SigningKey:
+        """A new key, in the place of the one in this file.
+
+        Raises:
+            UnsafeKeyFile: it cannot be written there.
+        """
+        write_own(Path(path), _pem(Ed25519PrivateKey.generate()), place=os.replace)
+        return cls.from_file(path)
+
     def sign(self, data: bytes) -> bytes:
         """64 bytes that only this key can make."""
         return self._private.sign(data)
@@ -116,9 +126,14 @@ def _read(path: Path) -> Ed25519PrivateKey:
 
 
 def _write_new(path: Path, key: Ed25519PrivateKey) -> None:
-    pem = key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
     with contextlib.suppress(FileExistsError):
-        write_own(path, pem, place=os.link)
+        write_own(path, _pem(key), place=os.link)
+
+
+def _pem(key: Ed25519PrivateKey) -> bytes:
+    return key.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
 
 
 def read_own(path: Path) -> bytes:

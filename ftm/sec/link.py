@@ -33,7 +33,7 @@ from ..bricks.sealed_frames import (
     Sealed,
     Still,
 )
-from .authority import AwaitRevocations
+from .authority import AwaitRevocations, GetRevocations
 from .certificates import HEARTBEAT
 from .handshake import Participant, Response
 from .identity import Identity, root_file
@@ -58,6 +58,8 @@ FIRST_WAIT, LONGEST_WAIT = 0.5, 8.0
 """Seconds until a frame that is not answered is sent again; doubled each time."""
 HEARD_WITHIN = HEARTBEAT + LONGEST_WAIT
 """Seconds in which the authority says something."""
+REFUSED_FOR = 5.0
+"""Seconds for which one end refuses all that the other one says: then they will not agree any more."""
 FIRST_PAUSE, LONGEST_PAUSE = 0.002, 0.25
 """Seconds until a frame that was refused is sent again; the same."""
 MOST_BYTES = 1_000_000
@@ -80,7 +82,7 @@ class Stream:
 class Partner(Secret):
     """Another participant, as this one knows it."""
 
-    __slots__ = ("inward", "life", "lock", "name", "outward", "path", "pump", "queue", "session")
+    __slots__ = ("inward", "life", "lock", "name", "outward", "path", "pump", "queue", "refused", "session")
 
     def __init__(self, path: str) -> None:
         self.path, self.name = path, certified(path)
@@ -91,6 +93,7 @@ class Partner(Secret):
         self.life = -1  # whose calls those are
         self.queue: deque[tuple[Part, Reach, Still]] = deque()
         self.pump: asyncio.Task[None] | None = None
+        self.refused: tuple[float, float] | None = None  # since when all is, and when that was seen last
 
 
 class Link(Identity):
@@ -102,6 +105,7 @@ class Link(Identity):
         self._partners: dict[str, Partner] = {}
         self._sessions: dict[bytes, Session] = {}
         self._responses: dict[bytes, Response] = {}
+        self._barred: set[str] = set()  # by address: whoever was revoked, until its next life
         self._is_closed = False
         self._watcher: asyncio.Task[None] | None = None
 
@@ -121,7 +125,8 @@ class Link(Identity):
         was, self._address = self._address, address
         self._know_names(address)
         self.path, self._me = address + self.path[len(was) :], None
-        self._enrolled = {address + path[len(was) :] for path in self._enrolled}
+        self._barred = {address + path[len(was) :] for path in self._barred}
+        self._enrolled = {address + path[len(was) :]: 0 for path in self._enrolled}
         self._end_sessions()
         for partner in self._partners.values():
             partner.path = address + partner.path[len(was) :]
@@ -142,6 +147,7 @@ class Link(Identity):
         me = await super()._identity()
         if self._watcher is None and not self._is_closed:
             self._watcher = self._node.loop.create_task(self._watch(), context=contextvars.Context())
+        self._end_distrusted(me)
         return me
 
     async def _watch(self) -> None:
@@ -166,6 +172,33 @@ class Link(Identity):
         for session in self._sessions.values():
             if not is_current or me.trust.is_revoked(session.peer.serial):
                 session.close(REVOKED if is_current else STALE_LIST)
+        for path, serial in list(self._enrolled.items()):
+            if me.trust.is_revoked(serial) and path not in self._barred:
+                self._bar(path)
+
+    def _bar(self, path: str) -> None:
+        """The certificate of one of ours was revoked: nothing is exchanged with it until its next life has another."""
+        if path == self.path:
+            self._renew(path)
+            self._me = None
+            self._end_sessions()
+        else:
+            self._barred.add(path)
+            self._distrust(path, f"its certificate is not accepted ({REVOKED})")
+
+    def _distrust(self, path: str, why: str) -> None:
+        if self._end.distrusts is not None:
+            self._end.distrusts(path, why)
+
+    def _renew(self, path: str) -> None:
+        self._enrolled.pop(path, None)
+
+    def begins_life(self, path: str) -> None:
+        """Whoever lives there now is another than before: if that one was revoked, this one gets a key of its own."""
+        self._partner(path).refused = None
+        if path in self._barred:
+            self._barred.discard(path)
+            self._renew(path)
 
     # -- hand-shakes ------------------------------------------------------------------------------------------------
 
@@ -199,6 +232,8 @@ class Link(Identity):
         partner.session = session
         self._sessions = {key: one for key, one in self._sessions.items() if one.is_open}
         self._sessions[session.number] = session
+        if partner.path in self._enrolled:
+            self._enrolled[partner.path] = session.peer.serial
 
     async def greet(self, hello: bytes) -> bytes:
         """Answer a hello. Nothing is believed yet.
@@ -324,15 +359,18 @@ class Link(Identity):
                     text = msgspec.msgpack.encode(Call(name, number, numbers.floor, parts, epoch, config))
                     reply = await reach(Sealed(session.seal(text, CALL)), wait)
                     opened = session.open(reply, BACK + number.to_bytes(8, "big"))
+                    partner.refused = None
                     return msgspec.msgpack.decode(opened, type=Back)
                 except AskTimeout:
                     wait = min(2 * wait, LONGEST_WAIT)
                     continue
                 except Rejected as error:
                     self._refuse(error.reason)
+                    await self._judge(partner, error.reason)
                 except Refused as no:
                     if no.reason != OUT_OF_ORDER and session is not None and partner.session is session:
                         partner.session = None  # The other end may have none.
+                    await self._judge(partner, no.reason)
                 except HoldfastError:
                     pass  # It is between two lives, or at its end, which whoever asks is told.
                 await asyncio.sleep(pause)
@@ -340,6 +378,27 @@ class Link(Identity):
             raise LinkLost(partner.path)
         finally:
             numbers.close(number)
+
+    async def _judge(self, partner: Partner, reason: str) -> None:
+        """Distrust one that nothing has been exchanged with for too long, but for refusals.
+
+        While the authority is not heard, or its list here is too old, nobody is believed, and nobody is to blame.
+        """
+        now = self._node.loop.time()
+        since, last = partner.refused or (now, now)
+        if reason == OUT_OF_ORDER or now - last > REFUSED_FOR / 2:  # It was answered; or nothing was said meanwhile.
+            since = now
+        partner.refused = since, now
+        if now - since > REFUSED_FOR:
+            partner.refused = None
+            try:
+                await self._authority(GetRevocations())
+            except HoldfastError:
+                return
+            me = self._me
+            if me is None or not me.trust.is_list_current(time.time()):
+                return
+            self._distrust(partner.path, f"nothing passes on its link ({reason})")
 
     # -- in ---------------------------------------------------------------------------------------------------------
 

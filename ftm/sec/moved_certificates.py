@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Any
 from ...supervision.spec import ChildSpec
 from ..bricks.standing import protected_at
 from ..model.composition import layers_of
-from .authority import Enrol, GetCertificate, Revoke
-from .certificates import about, make_request
-from .keys import SigningKey
-from .participants import LinkEnd, ask_authority, certified, key_file
+from .authority import GetCertificate, Revoke
+from .certificates import about
+from .participants import LinkEnd, ask_authority, certified, order_certificate
 from .sec_errors import EnrolmentRefused, NoCertificate
 
 if TYPE_CHECKING:
@@ -53,14 +52,13 @@ class CertifiedMove:
             self._certified.add(name)
 
     async def _enrol(self, name: str, path: str) -> None:
-        order = Enrol(make_request(SigningKey.from_file(key_file(self._settings.folder, path)), name))
         try:
-            await self._ask(order)
+            await order_certificate(self._node, self._settings, path, name)
         except EnrolmentRefused:
             if not self._settings.is_per_start or self._is_taken(path):
                 raise
             await self._ask(Revoke(name))  # It was that of an earlier start.
-            await self._ask(order)
+            await order_certificate(self._node, self._settings, path, name)
 
     async def settle(self, *, is_moved: bool) -> None:
         """Have what was certified for where they are not be revoked; of where they are, what others had before.

@@ -61,6 +61,10 @@ class EnrolmentRefused(Refusal, text="no certificate for {name!r}: {problem}"):
     problem: str
 
 
+class KeyRevoked(EnrolmentRefused, text="no certificate for {name!r}: {problem}"):
+    """All that the key was certified with under this name was revoked: only another key is certified."""
+
+
 class NoCertificate(Refusal, text="there is no valid certificate of {name!r}"):
     """The authority has issued none, or only revoked ones."""
 

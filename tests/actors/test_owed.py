@@ -1,6 +1,7 @@
 """What an ended life owed fails at once with the reason of its end, wherever it was lived."""
 
 import asyncio
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -23,6 +24,12 @@ class Count(hf.Message[int]): ...
 
 class End(hf.Message):
     how: str
+
+
+class Begin(hf.Message): ...
+
+
+class Came(hf.Message[list[str]]): ...
 
 
 class Hang(hf.Message[None]): ...
@@ -84,11 +91,13 @@ async def end(system: hf.ActorSystem, ref: hf.ActorRef[Promises], how: str) -> N
             ref.tell(End(how))
 
 
-async def started(system: hf.ActorSystem, place: str, restart: Any, recovery: Any) -> hf.ActorRef[Promises]:
+async def started(
+    system: hf.ActorSystem, place: str, restart: Any, recovery: Any, kind: type[Promises] = Promises
+) -> hf.ActorRef[Promises]:
     isolation: Any = "process" if place == "process" else "task"
-    child = hf.child("a", hf.start(Promises), restart=restart, isolation=isolation, recovery=recovery)
+    child = hf.child("a", hf.start(kind), restart=restart, isolation=isolation, recovery=recovery)
     await system.start(hf.supervisor("top", children=[child], isolation="process" if place == "subtree" else "task"))
-    return system.ref("/t/top/a", Promises)
+    return system.ref("/t/top/a", kind)
 
 
 async def promise_and_end(system: hf.ActorSystem, place: str, restart: Any, how: str, recovery: Any = None) -> None:
@@ -158,6 +167,100 @@ async def test_a_recorded_actor_keeps_its_promises_over_a_crash(system: hf.Actor
     ref.tell(End("crash"))
     ref.tell(Answer())
     assert await asked == "late"
+
+
+class Forgetful(Promises):
+    """Holds its handles where no snapshot keeps them."""
+
+    key_variables = ()
+
+
+class Asker(hf.Actor):
+    """Asks in a recorded turn, and keeps what came of it."""
+
+    def __init__(self) -> None:
+        self.came: list[str] = []
+
+    @hf.on(Begin)
+    async def begin(self, message: Begin) -> None:
+        try:
+            self.came.append(await self.ctx.find("/t/top/a", Promises).ask(Question(), LONG))
+        except hf.AskFailed as error:
+            self.came.append(str(error))
+
+    @hf.on(Came)
+    def what_came(self, message: Came) -> list[str]:
+        return self.came
+
+
+FORGOTTEN = "the handle was in nothing that the next one has"
+
+
+async def save_and_end(system: hf.ActorSystem, ref: hf.ActorRef[Promises], how: str) -> None:
+    if how == "stop":  # The last snapshot of a life comes then.
+        ref.tell(End("stop"))
+        return
+    await system.checkpoint(ref)
+    await end(system, ref, how)
+
+
+@pytest.mark.asyncio(loop_factories=["uvloop"])
+@pytest.mark.parametrize("how", ["stop", "crash", "kill"])
+@pytest.mark.parametrize("place", ["task", "process", "subtree"])
+async def test_what_the_next_life_of_a_recorded_actor_has_no_handle_for_fails_at_once(
+    system: hf.ActorSystem, place: str, how: str
+) -> None:
+    ref = await started(system, place, "permanent", hf.hybrid(3600.0), Forgetful)
+    asked = [ref.ask(Question(), LONG) for _ in range(3)]
+    assert await ref.ask(Count(), LONG) == 3
+    await save_and_end(system, ref, how)
+    for one in asked:
+        with pytest.raises(hf.AskFailed, match=FORGOTTEN):
+            await one
+    again = ref.ask(Question(), LONG)
+    ref.tell(Answer())
+    assert await again == "late"
+
+
+@pytest.mark.asyncio(loop_factories=["uvloop"])
+@pytest.mark.parametrize("place", ["task", "process"])
+async def test_a_replay_makes_the_handle_again(system: hf.ActorSystem, place: str) -> None:
+    """No snapshot has come in between: it does not matter where the handle is."""
+    ref = await started(system, place, "permanent", hf.hybrid(3600.0), Forgetful)
+    asked = ref.ask(Question(), LONG)
+    assert await ref.ask(Count(), LONG) == 1
+    ref.kill()
+    ref.tell(Answer())
+    assert await asked == "late"
+
+
+@pytest.mark.asyncio(loop_factories=["uvloop"])
+@pytest.mark.parametrize("kind", [Promises, Forgetful])
+async def test_a_turn_hears_once_that_nobody_will_answer_it_also_when_the_root_is_started_again(
+    tmp_path: Path, kind: type[Promises]
+) -> None:
+    store = f"sqlite:{tmp_path / 's.db'}"
+    top = hf.supervisor(
+        "top",
+        children=[
+            hf.child("a", hf.start(kind), recovery=hf.hybrid(3600.0)),
+            hf.child("b", hf.start(Asker), recovery=hf.hybrid(3600.0)),
+        ],
+    )
+    async with hf.ActorSystem("t", store=store, log=False) as system:
+        await system.start(top)
+        promises, asker = system.ref("/t/top/a", kind), system.ref("/t/top/b", Asker)
+        asker.tell(Begin())
+        while await promises.ask(Count(), LONG) == 0:
+            await asyncio.sleep(0)
+        await system.checkpoint(promises)
+    for _ in range(2):
+        async with hf.ActorSystem("t", store=store, log=False) as system:
+            await system.start(top)
+            promises, asker = system.ref("/t/top/a", kind), system.ref("/t/top/b", Asker)
+            promises.tell(Answer())
+            [came] = await asker.ask(Came(), LONG)
+            assert came == "late" if kind is Promises else FORGOTTEN in came
 
 
 async def test_who_waits_for_a_lock_hears_that_the_registry_is_gone(system: hf.ActorSystem) -> None:

@@ -115,6 +115,27 @@ CHECKS = {
         ONCE,
         "test_a_process_orders_those_alone",
     ),
+    "what the next life has no handle for fails": Check(
+        "checkpoint/home/pending_asks.py",
+        "            self.later.pop(key).fail(AskFailed(self._home.path, FORGOTTEN))\n",
+        "            pass\n",
+        "tests/actors/test_owed.py",
+        "test_what_the_next_life and task and kill",
+    ),
+    "what the state that it begins with has a handle for is kept": Check(
+        "checkpoint/life/recorded_life.py",
+        "            self.restored.promises.add(handle.id)\n",
+        "            pass\n",
+        "tests/actors/test_owed.py",
+        "test_a_turn_hears_once",
+    ),
+    "what a replay makes a handle for is kept": Check(
+        "checkpoint/life/recorded_context.py",
+        "            self.recorded.restored.promises.add(feed.id)\n",
+        "            pass\n",
+        "tests/actors/test_owed.py",
+        "test_a_replay_makes",
+    ),
     "a recorded holder is found when it lives again": Check(
         "checkpoint/home/switch.py",
         "for come in self.node.awaited.pop(self.path, ()):",
@@ -1076,8 +1097,8 @@ CHECKS = {
     ),
     "a state that comes back has refs, not what was saved of them": Check(
         "checkpoint/snapshot/key_variables.py",
-        "partial(read, refs=actor.ctx._cell.node.ref_at)",
-        "read",
+        "partial(read, refs=actor.ctx._cell.node.ref_at, handles=handles)",
+        "partial(read, handles=handles)",
         "tests/checkpoint/test_kept_refs.py",
         "test_they_are_refs_again_in_the_next_life",
     ),

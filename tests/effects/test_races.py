@@ -224,6 +224,35 @@ async def test_what_comes_at_once_is_heard_one_after_another(tmp_path: Path) -> 
         assert await ref.ask(Look(), IN_TIME) == ["paid", "then paid", "late at once"]
 
 
+async def test_a_message_that_is_taken_as_its_wait_is_given_up_comes_behind_what_is_queued_by_then(
+    tmp_path: Path,
+) -> None:
+    """Also behind later ones of the same sender: of the order of messages this is the exception."""
+    world = str(tmp_path)
+    async with running(tmp_path) as system:
+        ref = await system.start(racer())
+        asked = ref.ask(Race(world), IN_TIME)
+        await begun(tmp_path, "paid")
+        await until(system, 1)
+        home = switch_of(system._node.cell_at(PATH))
+        assert home is not None
+        tell = home.calls._tell
+
+        def together(turn: int, k: int, answer: Any) -> None:
+            home.calls._tell = tell  # type: ignore[method-assign]
+            tell(turn, k, answer)
+            for message in (Cancel("first"), Other("second")):
+                Context().run(ref.tell, message)
+
+        home.calls._tell = together  # type: ignore[method-assign]  # the moment cannot be met otherwise
+        let(world, "paid")
+        await begun(tmp_path, "then")
+        let(world, "then paid")
+        let(world, "end")
+        assert await asked == "paid, then paid"
+        assert (await ref.ask(Look(), IN_TIME))[-2:] == ["other second", "late first"]
+
+
 # -- giving up -------------------------------------------------------------------------------------------------------
 
 

@@ -105,3 +105,31 @@ async def test_an_alternate_that_blocks_costs_the_life_and_its_message_is_put_as
     with pytest.raises(hf.Quarantined):
         await ref.ask(Add(13), timeout=60)
     assert await ref.ask(Add(2), timeout=60) == 1, "without recovery the state went with the life"
+
+
+class Promise(hf.Message[str]): ...
+
+
+class Forgetful(Counter):
+    """Holds the handle of a later reply where no state has it."""
+
+    _handle: hf.ReplyHandle[str] | None = None
+
+    @hf.on(Promise)
+    def promise(self, message: Promise) -> hf.ReplyHandle[str]:
+        self._handle = self.ctx.reply_handle()
+        return self._handle
+
+
+async def test_a_promised_reply_whose_handle_is_in_no_state_ends_by_its_deadline_after_a_failover(
+    system: hf.ActorSystem,
+) -> None:
+    ref = await system.start(hf.child("alice", hf.start(Forgetful), mechanism=hf.ftm.PBR()))
+    assert await ref.ask(Add(1), timeout=60) == 1
+    await two_again(ref)
+    asked = ref.ask(Promise(), timeout=4.0)
+    assert await ref.ask(Add(2), timeout=60) == 2
+    os.kill(pid_of(system, ref, "r1"), signal.SIGKILL)
+    assert await ref.ask(Add(3), timeout=60) == 3
+    with pytest.raises(hf.AskTimeout):
+        await asked

@@ -16,7 +16,78 @@ SPOILED = "tests/ftm/test_spoiled_states.py"
 RANDOM_HOOKS = "tests/ftm/test_random_hooks.py"
 FAILOVER, CHECKS_ALONE = "tests/ftm/test_failover.py", "tests/ftm/test_checks.py"
 AUTHORS = "tests/ftm/test_author_bricks.py"
+REVOKED, LINKS = "tests/ftm/test_revoked_replicas.py", "tests/ftm/sec/test_link.py"
 CHECKS = {
+    "an answer that is in hand when the backup is lost is told of": Check(
+        "ftm/mechanisms/pbr.py",
+        "            if standing.other.path is None:  # It was lost with this in hand.\n",
+        "            if False:\n",
+        PBR,
+        "goes_on_alone_and_says_so",
+    ),
+    "and when the follower is": Check(
+        "ftm/mechanisms/lfr.py",
+        "        if standing.other.path is None:  # It was lost with this in hand.\n",
+        "        if False:\n",
+        PBR,
+        "goes_on_alone_and_says_so",
+    ),
+    "a replica that is revoked is lost at once": Check(
+        "ftm/sec/link.py",
+        """            self._distrust(path, f"its certificate is not accepted ({REVOKED})")\n""",
+        "            pass\n",
+        LINKS,
+        "test_a_revocation_ends",
+    ),
+    "a key that was revoked is not certified again": Check(
+        "ftm/sec/authority.py",
+        "        if self._is_key_revoked(name, public):\n",
+        "        if False:\n",
+        REVOKED,
+        "test_a_replica_that_is_revoked and PBR",
+    ),
+    "the next life of one that was revoked gets a key of its own": Check(
+        "ftm/group/replicas.py",
+        "                    self.link.begins_life(self.place(name))\n",
+        "                    pass\n",
+        REVOKED,
+        "test_a_replica_that_is_revoked and PBR",
+    ),
+    "nothing is waited for from one that is barred": Check(
+        "ftm/group/membership.py",
+        "        return not self.suspected[name].is_barred and ",
+        "        return ",
+        REVOKED,
+        "test_a_leader_that_is_all_there_is",
+    ),
+    "the root's end takes another key when its own was revoked": Check(
+        "ftm/sec/link.py",
+        "        if path == self.path:\n            self._renew(path)\n",
+        "        if path == self.path:\n",
+        REVOKED,
+        "test_the_root_takes_another_key",
+    ),
+    "one that nothing passes to is distrusted": Check(
+        "ftm/sec/link.py",
+        """            self._distrust(partner.path, f"nothing passes on its link ({reason})")\n""",
+        "            pass\n",
+        LINKS,
+        "test_one_that_another_key_has_come_to",
+    ),
+    "nobody is distrusted while no authority is heard": Check(
+        "ftm/sec/link.py",
+        "            except HoldfastError:\n                return\n            me = self._me\n",
+        "            except HoldfastError:\n                pass\n            me = self._me\n",
+        LINKS,
+        "test_one_that_another_key_has_come_to",
+    ),
+    "a certificate of another key is not taken": Check(
+        "ftm/sec/identity.py",
+        "        if public_of(certificate) != raw_public(key.public):\n",
+        "        if False:\n",
+        LINKS,
+        "test_one_that_another_key_has_come_to",
+    ),
     "a request that is handed on twice is not computed twice": Check(
         "ftm/bricks/bricks.py",
         "        if len({one.feed.id for one in work.requests}) < len(work.requests):",
@@ -460,7 +531,7 @@ CHECKS = {
     ),
     "who alone has the state is not killed on suspicion": Check(
         "ftm/group/membership.py",
-        "        return is_alive and not self.backups(lives) and not is_hopeless\n",
+        "        return not self.suspected[name].is_barred and now - self.suspected[name].since < hopeless\n",
         "        return False\n",
         FAILOVER,
         "test_a_silent_primary_that_nobody",

@@ -132,7 +132,9 @@ async def test_a_certificate_for_the_old_address_that_nobody_has_revoked_opens_n
         await moved(system)
         for part in PARTS:
             path = f"{HERE}/ftm/{part}"
-            key = SigningKey.from_file(key_file(SEC(CA).folder, path))
+            key = SigningKey.renewed(
+                key_file(SEC(CA).folder, path)
+            )  # That of before was revoked, and is not certified.
             left = await authority(system).ask(Enrol(make_request(key, path)), IN_TIME)
             assert await greeted(system, await party(system, path, left), f"{THERE}/ftm/r1") == "wrong_peer"
         assert await one.ask(Add(), IN_TIME) == 1

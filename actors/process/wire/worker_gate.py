@@ -11,6 +11,7 @@ process and nothing else.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING, Any, Final, get_args
@@ -268,8 +269,8 @@ class WorkerGate:
     def ask(self, frame: frames.Ask) -> None:
         """As for a message; its deadline is a time."""
         self.send(frame)
-        if frame.until != frame.until:
-            raise BadFrame("an ask with a deadline that is no time")
+        if not math.isfinite(frame.until):
+            raise BadFrame(f"an ask with a deadline that is no time ({frame.until})")
 
     def publish(self, frame: frames.Publish) -> None:
         """It publishes as itself, and no orders."""

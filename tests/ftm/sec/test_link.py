@@ -11,8 +11,11 @@ import pytest
 import holdfast as hf
 from holdfast.ftm.bricks.sealed_frames import TELLS, Agree, Back, Call, Greet, LinkLost, Part, Refused, Sealed
 from holdfast.ftm.mechanisms.sec import SEC
-from holdfast.ftm.sec.authority import CertificationAuthority, GetRoot, Revoke
-from holdfast.ftm.sec.certificates import make_list
+from holdfast.ftm.sec.authority import CertificationAuthority, GetCertificate, GetRoot, Revoke
+from holdfast.ftm.sec.certificates import make_list, public_of
+from holdfast.ftm.sec.keys import SigningKey
+from holdfast.ftm.sec.link import LONGEST_PAUSE, REFUSED_FOR
+from holdfast.ftm.sec.participants import key_file
 from holdfast.ftm.sec.sec_errors import Rejected
 
 CA = "/app/ca"
@@ -26,7 +29,11 @@ class Wire:
         self.epochs = {PROXY: 1, REPLICA: 1}
         sec = SEC(CA)
         self.inner: Any = sec.open_link(system._node, "/app/c", REPLICA, lambda: self.epochs[REPLICA])
-        self.outer: Any = sec.open_link(system._node, "/app/c", PROXY, lambda: self.epochs[PROXY], lambda: [REPLICA])
+        self.distrusted: list[tuple[str, str]] = []
+        self.outer: Any = sec.open_link(
+            system._node, "/app/c", PROXY, lambda: self.epochs[PROXY], lambda: [REPLICA],
+            lambda path, why: self.distrusted.append((path, why)),
+        )  # fmt: skip
         self.done: list[bytes] = []
         self.refused: list[str] = []
         self.on_frame = lambda: None
@@ -79,15 +86,14 @@ async def test_a_frame_of_an_epoch_that_has_ended_at_the_receiver_is_refused() -
         wire.close()
 
 
-@pytest.mark.parametrize("whom", [PROXY, REPLICA])
-async def test_a_revocation_ends_the_sessions_there_are(whom: str) -> None:
+async def test_a_revocation_ends_the_sessions_there_are() -> None:
     async with hf.ActorSystem("app", log=False) as system:
         authority = await system.start(hf.child("ca", hf.start(CertificationAuthority)))
         wire = Wire(system)
         await wire.outer.ready()
         assert (await wire.ask(b"before")).body == b"before"
         with system.events() as events:
-            assert await authority.ask(Revoke(whom)) == 1
+            assert await authority.ask(Revoke(REPLICA)) == 1
             await authority.ask(GetRoot())  # Whoever waited for a revocation has heard of it before this.
             asked = asyncio.ensure_future(wire.ask(b"after"))
             async with asyncio.timeout(20.0):
@@ -98,6 +104,51 @@ async def test_a_revocation_ends_the_sessions_there_are(whom: str) -> None:
             wire.is_wanted = False
             with pytest.raises(LinkLost):
                 await asked
+        assert wire.done == [b"before"]
+        assert wire.distrusted == [(REPLICA, "its certificate is not accepted (revoked)")]
+        wire.close()
+
+
+async def test_whoever_orders_certificates_gets_another_when_its_own_was_revoked() -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        authority = await system.start(hf.child("ca", hf.start(CertificationAuthority)))
+        wire = Wire(system)
+        await wire.outer.ready()
+        assert (await wire.ask(b"before")).body == b"before"
+        key = public_of(await authority.ask(GetCertificate(PROXY)))
+        assert await authority.ask(Revoke(PROXY)) == 1
+        assert (await wire.ask(b"after")).body == b"after"
+        assert wire.done == [b"before", b"after"]
+        assert wire.distrusted == []
+        assert public_of(await authority.ask(GetCertificate(PROXY))) != key
+        wire.close()
+
+
+async def test_one_that_another_key_has_come_to_is_distrusted_and_nobody_is_while_no_authority_is_heard() -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        authority = await system.start(hf.child("ca", hf.start(CertificationAuthority)))
+        wire = Wire(system)
+        await wire.outer.ready()
+        assert (await wire.ask(b"before")).body == b"before"
+        SigningKey.renewed(key_file(SEC(CA).folder, REPLICA))
+        wire.inner.close()
+        wire.inner = SEC(CA).open_link(system._node, "/app/c", REPLICA, lambda: wire.epochs[REPLICA])
+        asked = asyncio.ensure_future(wire.ask(b"after"))
+        async with asyncio.timeout(4 * REFUSED_FOR):
+            while not wire.distrusted:
+                await asyncio.sleep(0.01)
+        [(path, why)] = wire.distrusted
+        assert path == REPLICA
+        assert "no certificate" in why
+        await system.stop(authority)
+        wire.distrusted.clear()
+        end = len(wire.refused) + int(1.5 * REFUSED_FOR / LONGEST_PAUSE)
+        while len(wire.refused) < end:
+            await asyncio.sleep(0.01)
+        assert wire.distrusted == []
+        wire.is_wanted = False
+        with pytest.raises(LinkLost):
+            await asked
         assert wire.done == [b"before"]
         wire.close()
 

@@ -91,6 +91,8 @@ BREACHES: dict[str, Callable[[], bytes]] = {
     "an offer of another": lambda: frame(f.Offer(1, VICTIM, ADD, raw([1000]), OTHER)),
     "a publication of another": lambda: frame(f.Publish(1, "/t", ADD, raw([1]), OTHER)),
     "an ask until no time": lambda: frame(f.Ask(1, VICTIM, ADD, raw([0]), float("nan"))),
+    "an ask until the end of time": lambda: frame(f.Ask(1, VICTIM, ADD, raw([0]), float("inf"))),
+    "an ask until before all time": lambda: frame(f.Ask(1, VICTIM, ADD, raw([0]), float("-inf"))),
     "a chain without end": lambda: frame(f.Ask(1, VICTIM, ADD, raw([0]), 1e18, 0, None, (("/a", 1),) * 5000)),
     "a name never given": lambda: frame(f.Tell(99, ADD, raw([0]))),
     "a name below zero": lambda: frame(f.Tell(-1, ADD, raw([0]))),

@@ -9,9 +9,10 @@ from collections.abc import Callable
 import pytest
 
 from holdfast.actors.process.wire import frames as f
+from holdfast.actors.process.wire.worker_gate import COMMANDS
 from tests.actors.process.hostile.conftest import World
-from tests.actors.process.hostile.corpus import corpus
-from tests.actors.process.hostile.forging import framed
+from tests.actors.process.hostile.corpus import COMMAND, HOME, corpus, readdressed, verb
+from tests.actors.process.hostile.forging import EVIL, framed
 from tests.actors.process.hostile.players import Ping
 
 SESSIONS = int(os.environ.get("HOLDFAST_FUZZ", "25"))
@@ -44,8 +45,7 @@ CHANGES: tuple[Callable[[random.Random, bytearray], None], ...] = (flip, flip, c
 
 def of_evil(data: bytes) -> bytes:
     """The frame as if our worker had written it: with its own address, where there is one."""
-    new = b"\xad/app/sup/evil"
-    return data.replace(b"\xaa/app/plain", new).replace(b"\xad/app/recorded", new)
+    return readdressed(data, HOME, EVIL)
 
 
 def session(draw: random.Random) -> bytes:
@@ -65,6 +65,11 @@ def test_the_corpus_has_every_kind_that_a_worker_sends() -> None:
     sent = (f.Tell, f.Ask, f.Reply, f.Failure, f.Launched, f.Command, f.Note, f.Record, f.Publish, f.Offer)
     for kind in sent:
         assert f.tagged(kind)[1] in kinds, kind.__name__
+
+
+def test_the_corpus_has_every_verb_that_the_gate_knows_and_no_other() -> None:
+    """`HOLDFAST_CORPUS=1` adds what a new one looks like, from the tests of it."""
+    assert {name for kind, name in map(verb, corpus()) if kind == COMMAND} == set(COMMANDS)
 
 
 @pytest.mark.parametrize("seed", range(4))

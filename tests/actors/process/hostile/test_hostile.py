@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
+from typing import Any
 
 import msgspec
 import pytest
 
 import holdfast as hf
 from holdfast.actors.process.wire import frames as f
+from holdfast.checkpoint.protocol import Live, Out, Released, Snapshot
 from holdfast.testing import probe
 from tests.actors.process.hostile.conftest import World
 from tests.actors.process.hostile.forging import BREACHES, EVIL, HARMLESS, SUP, VICTIM, command, frame, note, raw, tell
@@ -179,3 +182,35 @@ async def test_a_signal_that_says_it_was_carried_behind_a_move_ends_nobody(world
     for _ in range(2):
         await world.judge()
     assert victim._cell.life == life
+
+
+OUT = Out(1, "timer", "x", seconds=1.0)
+ENDLESS: dict[str, Callable[[float], object]] = {
+    "a delay": lambda number: Released(1, 1, [msgspec.structs.replace(OUT, seconds=number)]),
+    "an interval": lambda number: Released(1, 1, [msgspec.structs.replace(OUT, interval=number)]),
+    "a restore": Live,
+    "a snapshot": lambda number: Snapshot(1, b"", False, [], number),
+}
+
+
+@pytest.mark.parametrize("number", [float("inf"), float("-inf"), float("nan")])
+@pytest.mark.parametrize("what", ENDLESS)
+async def test_numbers_of_a_recorded_life_that_are_none_are_a_breach(what: str, number: float) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        other = await system.start(hf.child("other", hf.start(Victim)))
+        options: Any = {"isolation": "process", "recovery": hf.checkpoint_only(), "restart": "temporary"}
+        evil = await system.start(hf.child("evil", hf.start(Evil), **options))
+        with system.events() as events:
+            evil.tell(Write(frame(f.Record(evil.path, raw(ENDLESS[what](number))))))
+            breach = await next_event(events, hf.events.TrustBreached)
+        assert breach.address == evil.path
+        assert "float" in breach.problem
+        assert await other.ask(Add()) == 1
+
+
+async def test_an_event_with_a_number_that_is_none_is_not_shown(world: World) -> None:
+    with world.system.events() as events:
+        for number in (float("inf"), float("nan"), 2.5):
+            await world.write(note("ReplayPaced", address=EVIL, turns=1, seconds=number, held=1))
+        assert await world.evil.ask(Ping(), timeout=60) == 1
+        assert [event.seconds for event in events.take() if isinstance(event, hf.events.ReplayPaced)] == [2.5]

@@ -18,6 +18,20 @@ CHECKS = {
         CLAIMS,
         "test_an_order_among_the_outputs and asyncio",
     ),
+    "an ask ends at a time": Check(
+        "actors/process/wire/worker_gate.py",
+        "        if not math.isfinite(frame.until):\n",
+        "        if frame.until != frame.until:\n",
+        "tests/actors/process/hostile/test_hostile.py",
+        "test_a_breach_ends_the_worker",
+    ),
+    "what a recorded life says of time is finite": Check(
+        "checkpoint/protocol.py",
+        "Annotated[float, msgspec.Meta(ge=-sys.float_info.max, le=sys.float_info.max)]",
+        "float",
+        "tests/actors/process/hostile/test_hostile.py",
+        "test_numbers_of_a_recorded_life",
+    ),
     "claims grant nothing": Check(
         "actors/kernel/bindings.py",
         "for port, to in more.bindings.items() if port not in more.claimed}",
