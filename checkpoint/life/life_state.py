@@ -175,6 +175,11 @@ class LifeWaits:
         effects = (future for future, kind in self.outcomes.values() if isinstance(kind, EffectCall))
         return self.resting > 0 or not all(future.done() for future in effects)
 
+    @property
+    def may_be_left(self) -> bool:
+        """Whether the turn in hand rests, and all that it has let out so far was accepted."""
+        return self.resting > 0 and all(kind is not None or future.done() for future, kind in self.outcomes.values())
+
     def rested(self) -> None:
         """Something has come that a turn has waited for, perhaps an earlier one."""
         self.resting = max(0, self.resting - 1)

@@ -201,7 +201,7 @@ class Resting(Pending):
 
     def cancel(self, msg: Any = None) -> bool:
         if not self.done():
-            self._over_soon()
+            self._life.waits.rested()  # At once: what the handler does next may leave in this very step.
         return super().cancel(msg)
 
     def _over_soon(self) -> None:

@@ -415,7 +415,7 @@ class Life:
 
     def leave_turn(self) -> bool:
         """Leave the turn in hand for the next life, which runs it again from its start; False if it does not rest."""
-        if not self.waits.resting or self.feed is None or not self.is_live or not self.method.replays:
+        if not self.waits.may_be_left or self.feed is None or not self.is_live or not self.method.replays:
             return False
         self.feed, self.outs = None, []  # What its handler says while it is cancelled does not count.
         self.stage.is_adrift = True
