@@ -26,6 +26,8 @@ SEEDS = range(FIRST, FIRST + CHANGES)
 NUMBERS = 5
 KINDS = ("code", "state", "place", "bind")
 PAUSES = (0.0, 0.005, 0.01, 0.02, 0.05, 0.1, 0.3)
+LATENCY = (0.0, 0.02)
+"""Seconds that a word to or from a process takes."""
 IN_TIME = 100.0
 """Virtual seconds in which an answer comes."""
 METHOD = hf.hybrid(interval=0.1, max_deliveries=1000)
@@ -195,7 +197,7 @@ def change(seed: int, isolation: str, schedule: dict[str, Any]) -> None:
     """One show under one schedule."""
     print(f"HOLDFAST_FIRST={seed} {isolation} {schedule}")
 
-    @simulate(store="simulated", durability="fsync", sync=(0.0, 0.01), intensity=10_000, **schedule)
+    @simulate(store="simulated", durability="fsync", sync=(0.0, 0.01), latency=LATENCY, intensity=10_000, **schedule)
     async def show(system: GuardedSystem, simulation: Simulation) -> None:
         system.expect_crashes()
         system.expect_exceptions()  # A wait that is left behind may end in WaitTimeout.
