@@ -524,6 +524,10 @@ class RecordedContext(ActorContext):
     def _is_adrift(self) -> bool:
         return self.recorded.stage.is_adrift
 
+    @property
+    def _owes_turn(self) -> bool:
+        return self.recorded.stage.owed >= 0
+
     def _rests(self) -> bool:
         return self.recorded.waits.resting > 0 or not self.recorded.is_live
 
@@ -551,7 +555,8 @@ class RecordedContext(ActorContext):
         if self._is_adrift and isinstance(call, QueuedOrder):
             self._cell.urge(call)  # The next life obeys it, before the turn that was left is run again.
             return True
-        if self.recorded.is_live:
+        is_behind = self._owes_turn and isinstance(call, QueuedOrder) and call.order.is_change
+        if self.recorded.is_live and not is_behind:
             self.recorded.say_it_waits()  # The order may be that nothing is handled.
             return False
         self.recorded.stage.postponed.append(call)
