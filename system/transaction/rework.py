@@ -176,8 +176,7 @@ class Rework(StagedWork):
         switch = switch_of(cell)
         if switch is not None:
             before = len(switch.arrival.unsaved)
-            for piece in self._saved:
-                switch.from_life(SNAPSHOT.decode(piece))
+            switch.arrival.take_ahead([SNAPSHOT.decode(piece) for piece in self._saved])
             refuse_unsaved(cell, switch, before)
         if start is not None:
             self._known_as(cell, start)
