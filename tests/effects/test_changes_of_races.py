@@ -137,9 +137,7 @@ class Show:
             if self.draw.random() < 0.5:
                 await self.judge()
             if self.draw.random() < 0.2 and not self.force.is_protected:
-                self.said.append("crash")
-                self.system = await self.simulation.crash_root()
-                await self.plant()
+                await self.crash()
 
     def add(self, change: Any, step: str, wanted: Force) -> None:
         match step:
@@ -166,6 +164,17 @@ class Show:
     async def kill(self) -> None:
         await asyncio.sleep(self.draw.choice(PAUSES))
         self.player.kill()
+
+    async def crash(self) -> None:
+        """Kill the program. (What went through a binding is replayed to the same address: see `docs/guarantees.md`.)"""
+        if any("bind" in steps for steps in self.said):
+            try:
+                await self.system.checkpoint(self.player, timeout=5.0)
+            except hf.HoldfastError:
+                return
+        self.said.append("crash")
+        self.system = await self.simulation.crash_root()
+        await self.plant()
 
     async def judge(self) -> None:
         """What is in force is what runs, now and in the next life."""
