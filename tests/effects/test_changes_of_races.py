@@ -24,7 +24,14 @@ FIRST = int(os.environ.get("HOLDFAST_FIRST", "1"))
 CHANGES = int(os.environ.get("HOLDFAST_CHANGES", "4"))
 SEEDS = range(FIRST, FIRST + CHANGES)
 NUMBERS = 5
-KINDS = ("code", "state", "place", "bind")
+STEPS = ("code", "state", "place")
+KINDS = (*STEPS, "bind")
+FOUND = {
+    "its turn ended by itself": (15, KINDS),
+    "its life had ended in a turn": (21, KINDS),
+    "it had saved its state before": (19, STEPS),
+}
+"""What has once been wrong when a change came, with the seed of a schedule in which it does: to a player in a process."""
 PAUSES = (0.0, 0.005, 0.01, 0.02, 0.05, 0.1, 0.3)
 LATENCY = (0.0, 0.02)
 """Seconds that a word to or from a process takes."""
@@ -58,11 +65,14 @@ class Show:
         simulation: of it.
         seed: draws the programs, and what befalls them.
         isolation: where the player lives at first.
+        kinds: of steps.
     """
 
-    def __init__(self, system: GuardedSystem, simulation: Simulation, seed: int, isolation: Any) -> None:
+    def __init__(
+        self, system: GuardedSystem, simulation: Simulation, seed: int, isolation: Any, kinds: tuple[str, ...]
+    ) -> None:
         self.system: hf.ActorSystem = system
-        self.simulation, self.seed, self.declared = simulation, seed, isolation
+        self.simulation, self.seed, self.declared, self.kinds = simulation, seed, isolation, kinds
         self.draw = random.Random(f"changes {seed}")
         self.force = Force(isolation)
         self.may_kill = asyncio.Event()
@@ -110,7 +120,7 @@ class Show:
     def steps(self) -> list[str]:
         if self.force.is_protected:
             return ["bare"]
-        kinds = self.draw.sample(KINDS, self.draw.choice((1, 1, 2, 3)))
+        kinds = self.draw.sample(self.kinds, self.draw.choice((1, 1, 2, 3)))
         return ["protect"] if self.draw.random() < 0.15 else kinds
 
     async def change(self) -> None:
@@ -203,7 +213,7 @@ class Show:
         self.look()
 
 
-def change(seed: int, isolation: str, schedule: dict[str, Any]) -> None:
+def change(seed: int, isolation: str, schedule: dict[str, Any], kinds: tuple[str, ...] = KINDS) -> None:
     """One show under one schedule."""
     print(f"HOLDFAST_FIRST={seed} {isolation} {schedule}")
 
@@ -213,7 +223,7 @@ def change(seed: int, isolation: str, schedule: dict[str, Any]) -> None:
         system.expect_exceptions()  # A wait that is left behind may end in WaitTimeout.
         system.expect_dead_letters()  # What a mechanism that is taken away has told itself.
         WORLD.clear()
-        one = Show(system, simulation, seed, isolation)
+        one = Show(system, simulation, seed, isolation, kinds)
         await one.plant()
         async with asyncio.timeout(IN_TIME * 10):
             await asyncio.gather(one.play(), one.ring(), one.change())
@@ -232,3 +242,9 @@ def test_what_is_in_force_is_what_runs(isolation: str) -> None:
 def test_so_it_is_in_any_order_of_steps(isolation: str) -> None:
     for seed in SEEDS:
         change(seed, isolation, {"seed": seed})
+
+
+@pytest.mark.parametrize("what", FOUND)
+def test_what_was_found_stays_mended(what: str) -> None:
+    seed, kinds = FOUND[what]
+    change(seed, "process", {"seed": seed}, kinds)

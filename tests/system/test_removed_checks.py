@@ -28,6 +28,7 @@ FAR_NAMED = "tests/control/test_far_names.py"
 SLOW = "tests/supervision/test_slow_restarts.py"
 UPGRADE = "tests/system/upgrade/test_check_upgrade.py"
 COLLECTIONS = "tests/system/test_full_collections.py"
+CHANGES = "tests/effects/test_changes_of_races.py"
 ORDERS = "tests/effects/test_orders_while_resting.py"
 RESTING = "tests/effects/test_moves_while_resting.py"
 CIRCLES = "tests/actors/test_circles.py"
@@ -50,6 +51,13 @@ UNCODABLE = "tests/system/test_uncodable.py"
 SHUTDOWN = "tests/supervision/test_shutdown.py"
 
 CHECKS = {
+    "the life that has obeyed an order is the one that goes on": Check(
+        "system/live_moves.py",
+        "        future.add_done_callback(lambda done: gate.close())  # The life that has obeyed is the one that goes on.\n",
+        "",
+        CHANGES,
+        "ended_by_itself",
+    ),
     "who has given orders to others does not go into a process": Check(
         "system/transaction/transaction.py",
         "            look_at_grants(change.operations)\n",
