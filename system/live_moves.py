@@ -290,20 +290,23 @@ class Moves:
             return await future
         gate = CommitGate(self._node.loop)
         gate.open()
-        future.add_done_callback(lambda done: gate.close())  # The life that has obeyed is the one that goes on.
+        future.add_done_callback(lambda done: gate.close())  # Who has obeyed goes on.
         try:
             while not future.done():
                 if rests(cell):
                     if isinstance(wanted, Resume):
                         return None  # It is in the middle of a turn, and so it is not suspended.
-                    renewed = self._renewed(cell, timeout, gate)
+                    life, renewed = cell.life, self._renewed(cell, timeout, gate)
                     try:
                         if is_alone:
                             await renewed
                         else:
                             await self._alone(cell, renewed, f"end of the turn of {cell.path}", timeout, gate)
-                    except HoldfastError:  # Then it waits for the turn, and says so when its time is over.
-                        await asyncio.wait((future,))
+                    except (
+                        HoldfastError
+                    ):  # Then it waits for the turn, or the next life; or says that its time is over.
+                        while not future.done() and cell.life == life:
+                            await asyncio.wait((future,), timeout=LOOK_AGAIN)
                 await asyncio.wait((future,), timeout=LOOK_AGAIN)
         finally:
             future.cancel()

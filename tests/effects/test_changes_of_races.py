@@ -1,4 +1,4 @@
-"""Transactions at random moments of turns that are random races: what is in force is what runs, and a kill changes nothing.
+"""Transactions at random moments of random races: what is in force is what runs, and a kill changes nothing.
 
 Steps: other code, another state, another place, mechanisms, another binding; several in one transaction. Lives and the
 whole program are killed besides. `HOLDFAST_CHANGES=1000` has so many seeds of each kind; `HOLDFAST_FIRST` is the first.
@@ -31,7 +31,7 @@ FOUND = {
     "its life had ended in a turn": (21, KINDS),
     "it had saved its state before": (19, STEPS),
 }
-"""What has once been wrong when a change came, with the seed of a schedule in which it does: to a player in a process."""
+"""What has gone wrong when a change came to a player in a process: a seed of it, and the kinds of steps."""
 PAUSES = (0.0, 0.005, 0.01, 0.02, 0.05, 0.1, 0.3)
 LATENCY = (0.0, 0.02)
 """Seconds that a word to or from a process takes."""

@@ -53,7 +53,7 @@ SHUTDOWN = "tests/supervision/test_shutdown.py"
 CHECKS = {
     "the life that has obeyed an order is the one that goes on": Check(
         "system/live_moves.py",
-        "        future.add_done_callback(lambda done: gate.close())  # The life that has obeyed is the one that goes on.\n",
+        "        future.add_done_callback(lambda done: gate.close())  # Who has obeyed goes on.\n",
         "",
         CHANGES,
         "ended_by_itself",
