@@ -790,14 +790,14 @@ CHECKS = {
         "self._owes_turn and isinstance",
         "False and isinstance",
         CHANGES,
-        "life_had_ended",
+        "life_ended",
     ),
     "what was saved before a change is known does not count behind it": Check(
         "checkpoint/snapshot/snapshot_receiver.py",
         "self._is_ahead = bool(records)",
         "self._is_ahead = False",
         CHANGES,
-        "had_saved",
+        "state_saved",
     ),
     "an outcome counts of an effect that is out only": Check(
         "checkpoint/home/pending_asks.py",

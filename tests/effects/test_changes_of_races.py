@@ -27,9 +27,9 @@ NUMBERS = 5
 STEPS = ("code", "state", "place")
 KINDS = (*STEPS, "bind")
 FOUND = {
-    "its turn ended by itself": (15, KINDS),
-    "its life had ended in a turn": (21, KINDS),
-    "it had saved its state before": (19, STEPS),
+    "turn_ended": (15, KINDS),
+    "life_ended": (21, KINDS),
+    "state_saved": (19, STEPS),
 }
 """What has gone wrong when a change came to a player in a process: a seed of it, and the kinds of steps."""
 PAUSES = (0.0, 0.005, 0.01, 0.02, 0.05, 0.1, 0.3)

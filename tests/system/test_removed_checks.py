@@ -56,7 +56,7 @@ CHECKS = {
         "        future.add_done_callback(lambda done: gate.close())  # Who has obeyed goes on.\n",
         "",
         CHANGES,
-        "ended_by_itself",
+        "turn_ended",
     ),
     "who has given orders to others does not go into a process": Check(
         "system/transaction/transaction.py",
