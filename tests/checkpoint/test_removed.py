@@ -864,8 +864,8 @@ CHECKS = {
     ),
     "a turn that waits for a message no more rests no longer": Check(
         "checkpoint/life/recorded_context.py",
-        "            self._over_soon()\n        return super().cancel(msg)\n",
-        "            pass\n        return super().cancel(msg)\n",
+        "            self._life.waits.rested()  #",
+        "            pass  #",
         "tests/effects/test_waiting_turns.py",
         "test_a_turn_that_goes_on_rests_no_longer and gave",
     ),

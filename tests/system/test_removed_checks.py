@@ -620,8 +620,8 @@ CHECKS = {
     ),
     "the home keeps the new state though its process has not heard of it": Check(
         "system/transaction/rework.py",
-        "            for piece in self._saved:\n                switch.from_life(SNAPSHOT.decode(piece))\n",
-        "            pass\n",
+        "switch.arrival.take_ahead([SNAPSHOT.decode(piece) for piece in self._saved])",
+        "pass",
         COMMIT,
         "test_a_root_that_is_killed and finish and process",
     ),
