@@ -37,28 +37,21 @@ def replace_place(cell: Cell, spec: ChildSpec, *, is_lent: bool = False) -> None
 
     `is_lent`: for the time of a move only, so that no journal notes it.
     """
-    if isinstance(cell.spec, ChildSpec) and cell.spec.start is not spec.start:  # Its code was replaced meanwhile.
-        spec = dataclasses.replace(spec, start=cell.spec.start)
-    _change(
-        cell,
-        spec,
-        lambda known: dataclasses.replace(known, isolation=spec.isolation, limits=spec.limits),
-        is_noted=not is_lent,
-    )  # fmt: skip
+
+    def change(known: ChildSpec) -> ChildSpec:
+        return dataclasses.replace(known, isolation=spec.isolation, limits=spec.limits)
+
+    # What else has changed of it meanwhile, say its code or a binding, stays.
+    _change(cell, change(cell.spec) if isinstance(cell.spec, ChildSpec) else spec, change, is_noted=not is_lent)
 
 
 def replace_mechanism(cell: Cell, spec: ChildSpec, *, is_lent: bool = False) -> None:
     """The next lives at `cell` are protected as `spec` says, and live there; `is_lent` as in `replace_place`."""
-    if isinstance(cell.spec, ChildSpec) and cell.spec.start is not spec.start:  # Its code was replaced meanwhile.
-        spec = dataclasses.replace(spec, start=cell.spec.start)
-    _change(
-        cell,
-        spec,
-        lambda known: dataclasses.replace(
-            known, isolation=spec.isolation, limits=spec.limits, mechanism=spec.mechanism
-        ),
-        is_noted=not is_lent,
-    )  # fmt: skip
+
+    def change(known: ChildSpec) -> ChildSpec:
+        return dataclasses.replace(known, isolation=spec.isolation, limits=spec.limits, mechanism=spec.mechanism)
+
+    _change(cell, change(cell.spec) if isinstance(cell.spec, ChildSpec) else spec, change, is_noted=not is_lent)
 
 
 def replace_options(cell: Cell, options: dict[str, Any]) -> None:

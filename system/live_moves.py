@@ -288,28 +288,37 @@ class Moves:
         future, cell = order(cell, wanted, timeout), cell.living
         if not isinstance(wanted, (Resume, *BETWEEN_TURNS)) or switch_of(cell) is None:
             return await future
+        gate = CommitGate(self._node.loop)
+        gate.open()
+        future.add_done_callback(lambda done: gate.close())  # Who has obeyed goes on.
         try:
             while not future.done():
                 if rests(cell):
                     if isinstance(wanted, Resume):
                         return None  # It is in the middle of a turn, and so it is not suspended.
-                    renewed = self._renewed(cell, timeout)
+                    life, renewed = cell.life, self._renewed(cell, timeout, gate)
                     try:
                         if is_alone:
                             await renewed
                         else:
-                            await self._alone(cell, renewed, f"end of the turn of {cell.path}", timeout, None)
-                    except HoldfastError:  # Then it waits for the turn, and says so when its time is over.
-                        await asyncio.wait((future,))
+                            await self._alone(cell, renewed, f"end of the turn of {cell.path}", timeout, gate)
+                    except (
+                        HoldfastError
+                    ):  # Then it waits for the turn, or the next life; or says that its time is over.
+                        while not future.done() and cell.life == life:
+                            await asyncio.wait((future,), timeout=LOOK_AGAIN)
                 await asyncio.wait((future,), timeout=LOOK_AGAIN)
         finally:
             future.cancel()
         return future.result()
 
-    async def _renewed(self, cell: Cell, timeout: float) -> None:
-        """Have the life at an address, a turn of which rests, begin anew where it is, before that turn."""
+    async def _renewed(self, cell: Cell, timeout: float, gate: CommitGate) -> None:
+        """Have the life at an address, a turn of which rests, begin anew where it is, before that turn.
+
+        Not if the gate is closed meanwhile: its turn has ended by itself.
+        """
         spec = _spec_of(cell)
-        await self._moved(cell, timeout, lambda: self._made(cell, spec, timeout), lambda: None)
+        await self._moved(cell, timeout, lambda: self._made(cell, spec, timeout), lambda: None, gate)
 
     async def pause(self, cell: Cell, timeout: float, gate: CommitGate) -> None:
         """Bring a recorded or protected actor to rest where it lives; it goes on when the gate opens.

@@ -38,6 +38,8 @@ class Order:
     verb: ClassVar[str]
     is_beside: ClassVar[bool] = False
     """Whether it is obeyed in the middle of a turn that waits, too."""
+    is_change: ClassVar[bool] = False
+    """Whether turns are not run behind it as they would have been: it is not obeyed ahead of one that had begun."""
 
     def run(self, cell: Cell, actor: Actor) -> Any:
         """Carry it out; raises ControlFailed."""
@@ -57,6 +59,7 @@ class Suspend(Order):
     """Handle no message until Resume; twice is once."""
 
     verb = "suspend"
+    is_change = True
 
     def run(self, cell: Cell, actor: Actor) -> None:
         mailbox.suspend(cell)
@@ -66,6 +69,7 @@ class Resume(Order):
     """Handle messages again, in the order in which they came."""
 
     verb = "resume"
+    is_change = True
 
     def run(self, cell: Cell, actor: Actor) -> None:
         mailbox.resume(cell)
@@ -94,6 +98,7 @@ class ReplaceState(Order):
     """Put what `change` makes of the state in its place; returns the new one."""
 
     verb: ClassVar[str] = "replace_state"
+    is_change: ClassVar[bool] = True
     change: Change
 
     def run(self, cell: Cell, actor: Actor) -> Any:
@@ -116,6 +121,7 @@ class ReplaceCode(Order):
     """
 
     verb: ClassVar[str] = "replace_code"
+    is_change: ClassVar[bool] = True
     start: Start[Any]
     keeps_arguments: bool  # those of the old recipe, which only the actor's supervisor knows
     change: Change | None
@@ -217,6 +223,7 @@ class Prepare(Order):
     """
 
     verb: ClassVar[str] = "prepare"
+    is_change: ClassVar[bool] = True
     attempt: int
     wanted: tuple[ReplaceState | ReplaceCode, ...]
 
@@ -258,6 +265,7 @@ class Conclude(Order):
     """
 
     verb: ClassVar[str] = "conclude"
+    is_change: ClassVar[bool] = True
     attempt: int
     is_in_force: bool
     suspended: bool | None
@@ -323,6 +331,7 @@ class StandDown(Order):
     """
 
     verb: ClassVar[str] = "stand_down"
+    is_change: ClassVar[bool] = True
     attempt: int
 
     def run(self, cell: Cell, actor: Actor) -> Any:

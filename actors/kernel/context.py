@@ -679,6 +679,11 @@ class ActorContext:
         """Whether a turn was left in the middle: this life handles nothing any more."""
         return False
 
+    @property
+    def _owes_turn(self) -> bool:
+        """Whether a turn that had begun in an earlier life is to be run again, as it was, before anything changes."""
+        return False
+
     def _rests(self) -> bool:
         """Whether the turn in hand is at no work: it waits for a moment or a message, or is being handled again."""
         return False

@@ -61,6 +61,7 @@ class FromHere(Leaving):
             more.trap_exits,
             list(more.stash or ()),
         )
+        luggage.was_left = not actor.ctx._owes_turn
         # What belongs to the address: a new life that fails may have added to it.
         self._topics = set(more.belongings.topics)
         self._links, self._watches = set(more.ties.links), set(more.ties.watching)

@@ -95,6 +95,7 @@ class Luggage:
 
     suspended: bool = False
     traps: bool = False  # `ctx.trap_exits`
+    was_left: bool = True  # A turn that had begun was left at rest: what is ordered may come before it.
     state: bytes = b""  # packed with its handles, as `luggage.unpack` reads it
     rest: dict[str, Any] = dataclasses.field(default_factory=dict)
     data: bytes = b""  # its variables alone, as a snapshot has them

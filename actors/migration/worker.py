@@ -160,6 +160,7 @@ class FromOwnWorker(Leaving):
             case "taken" if not move.given_up.done():
                 move.rest_at = moment(told)
                 move.luggage.traps, move.luggage.suspended = bool(told["trap_exits"]), bool(told["suspended"])
+                move.luggage.was_left = not told.get("owes_turn")
                 move.at_rest()
                 self.worker.on_death(self.died)
                 self.left()

@@ -193,8 +193,9 @@ class GuestMove:
 
     def _taken(self, actor: Actor, state: bytes) -> None:
         self._state = state
-        more = actor.ctx._cell.extra()
-        self._say("taken", at=now(), trap_exits=more.trap_exits, suspended=bool(more.suspended & mailbox.BY_USER))
+        more, owes = actor.ctx._cell.extra(), actor.ctx._owes_turn
+        by_user = bool(more.suspended & mailbox.BY_USER)
+        self._say("taken", at=now(), trap_exits=more.trap_exits, suspended=by_user, owes_turn=owes)
 
     def _refused(self, why: str) -> None:
         self._say("refused", why=why)

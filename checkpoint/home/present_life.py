@@ -55,7 +55,8 @@ class PresentLife:
         is_kept_back: whether it waits for the others of its group.
         replayed: how many turns it is to handle again.
         diverged: why its replay has led elsewhere: nothing that it says counts.
-        is_void: whether a state was put in place from outside and could not be saved: nothing that it says counts.
+        is_void: whether its state is not the one that its home has for it, which has come from outside: nothing that it
+            says counts.
         seen_turn: the last turn that it has handled again.
         seen_k: how many outputs of that turn have come again.
         has_ended: whether the last one has ended as a turn of it has said; its supervisor decides what follows.
@@ -94,7 +95,7 @@ class PresentLife:
 
     @property
     def counts(self) -> bool:
-        """Whether what it says is heard."""
+        """Whether what it says counts; else it is about to end."""
         return self.diverged is None and not self.is_void
 
     @property

@@ -446,7 +446,7 @@ class Switch:
     def from_life(self, record: ToHome) -> None:
         """Take what the life says, in order."""
         life = self.life
-        if life.diverged is not None or life.is_void:
+        if not life.counts:
             return  # What it became is not what it was: above all, its snapshots must not be kept.
         try:
             if type(record) is TurnEnd:  # Before a `match`, which takes longer: there is one for each message.

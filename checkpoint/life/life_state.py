@@ -185,6 +185,11 @@ class LifeWaits:
         effects = (future for future, kind in self.outcomes.values() if isinstance(kind, EffectCall))
         return self.resting > 0 or not all(future.done() for future in effects)
 
+    @property
+    def may_be_left(self) -> bool:
+        """Whether the turn in hand rests, and all that it has let out so far was accepted."""
+        return self.resting > 0 and all(kind is not None or future.done() for future, kind in self.outcomes.values())
+
     def rested(self) -> None:
         """Something has come that a turn has waited for, perhaps an earlier one."""
         self.resting = max(0, self.resting - 1)
@@ -197,7 +202,10 @@ class LifeStage:
     Attributes:
         has_replayed: whether it has handled anything again.
         begins_suspended: whether it is suspended when it is live.
-        postponed: orders from outside that wait until it is live.
+        was_left: whether the turn that had begun was left at rest, by a life that has been carried over.
+        owed: the input whose turn had begun in a life that has ended in it: what that has let out the class of then has
+            to let out again. Until it is over, or rests, nothing is changed. -1: none.
+        postponed: orders from outside that wait until it is live, or until no turn is owed.
         ending: that it is to end behind the turn in hand, as that has said.
         stop_wanted: why it is to end when it is live.
         stopping: why it is to end behind the turn in hand, as it was told.
@@ -212,6 +220,8 @@ class LifeStage:
 
     has_replayed: bool = False
     begins_suspended: bool = False
+    was_left: bool = False
+    owed: int = -1
     postponed: list[Item] = dataclasses.field(default_factory=list)
     ending: EndWanted | None = None
     stop_wanted: ExitReason | None = None
@@ -226,6 +236,7 @@ class LifeStage:
 
     def judge(self, go: Go) -> None:
         """All was handled again: whether the life is to end now is for the home to say, which knows what was done."""
+        self.owed = -1 if self.was_left or self.begins_suspended else go.begun
         if go.ends is not None:
             self.stop_wanted, self.is_cut_off = go.ends.exit_reason, go.ends.is_cut_off
         elif 0 <= self.stop_turn <= go.ended:

@@ -202,7 +202,7 @@ class Resting(Pending):
 
     def cancel(self, msg: Any = None) -> bool:
         if not self.done():
-            self._over_soon()
+            self._life.waits.rested()  # At once: what the handler does next may leave in this very step.
         return super().cancel(msg)
 
     def _over_soon(self) -> None:
@@ -543,6 +543,10 @@ class RecordedContext(ActorContext):
     def _is_adrift(self) -> bool:
         return self.recorded.stage.is_adrift
 
+    @property
+    def _owes_turn(self) -> bool:
+        return self.recorded.stage.owed >= 0
+
     def _rests(self) -> bool:
         return self.recorded.waits.resting > 0 or not self.recorded.is_live
 
@@ -570,7 +574,8 @@ class RecordedContext(ActorContext):
         if self._is_adrift and isinstance(call, QueuedOrder):
             self._cell.urge(call)  # The next life obeys it, before the turn that was left is run again.
             return True
-        if self.recorded.is_live:
+        is_behind = self._owes_turn and isinstance(call, QueuedOrder) and call.order.is_change
+        if self.recorded.is_live and not is_behind:
             self.recorded.say_it_waits()  # The order may be that nothing is handled.
             return False
         self.recorded.stage.postponed.append(call)

@@ -379,10 +379,23 @@ class Life:
         self.port.to_home(TurnEnd(self.turn, feed.id, status, outs, answer, state, ends))
         if self.word is not None:
             self.word.mark(OVER)
+        self._settle(feed.id)
         if self.is_live and self.stage.begun >= 0:
             self.stage.begun = -1
             if self.returned:
                 self.handle_returned()
+
+    def _settle(self, number: int) -> None:
+        """The turn of this input is over, or left where it rests: if it was owed, orders are obeyed from now on."""
+        stage = self.stage
+        if stage.owed == number:
+            stage.owed = -1
+            self._obey_postponed()
+
+    def _obey_postponed(self) -> None:
+        postponed, self.stage.postponed = self.stage.postponed, []
+        for call in postponed:
+            self.cell.urge(call)
 
     def stop(self, reason: ExitReason) -> None:
         """End in good order: behind the turn in hand, or in the middle of one that rests, also if it does so only then.
@@ -417,10 +430,12 @@ class Life:
 
     def leave_turn(self) -> bool:
         """Leave the turn in hand for the next life, which runs it again from its start; False if it does not rest."""
-        if not self.waits.resting or self.feed is None or not self.is_live or not self.method.replays:
+        if not self.waits.may_be_left or self.feed is None or not self.is_live or not self.method.replays:
             return False
+        number = self.feed.id
         self.feed, self.outs = None, []  # What its handler says while it is cancelled does not count.
         self.stage.is_adrift = True
+        self._settle(number)
         return True
 
     def ignore(self, why: str) -> None:
@@ -496,6 +511,7 @@ class Life:
     def drop_queued(self, number: int) -> None:
         """An input is none any more."""
         self._drop(lambda feed: feed.id == number)
+        self._settle(number)
 
     def _drop(self, is_over: Callable[[Feed], bool]) -> None:
         """Forget inputs that are queued, and are none any more."""
@@ -541,9 +557,7 @@ class Life:
             self.want_snapshot()
         elif stage.has_replayed and self.method.snapshots:  # A crash loop must not replay the same turns for ever.
             self.port.when_told(self._snapshot_of_replay)  # The actor is released meanwhile.
-        postponed, stage.postponed = stage.postponed, []
-        for call in postponed:
-            self.cell.urge(call)
+        self._obey_postponed()
         if stage.stop_wanted is not None:
             self.cell.request_stop(stage.stop_wanted)
 

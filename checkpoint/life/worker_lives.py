@@ -83,6 +83,7 @@ class RecordedGuest:
         if options.get("trap_exits"):  # It was moved here.
             cell.extra().trap_exits = True
         life.stage.begins_suspended = bool(options.get("suspended"))
+        life.stage.was_left = bool(options.get("was_left"))
         port.begin(life, int(options["turn"]), list(options["stash"]))
 
     def host_for(self, spec: Any) -> AddressHost:

@@ -245,7 +245,7 @@ class ToRecordedWorker(ToWorker):
         port = RemoteLife(cell.path, worker)
         for record in switch.restore_records():
             port.to_life(record)
-        kept = {"suspended": luggage.suspended, "trap_exits": luggage.traps}
+        kept = {"suspended": luggage.suspended, "trap_exits": luggage.traps, "was_left": luggage.was_left}
         await self.launch(worker, {"recorded": {**home.launch_data(), **kept}})
         switch.attach(port)
         beginning.follow(live)
@@ -280,7 +280,10 @@ class ToRecordedHere(Entering):
     async def begin(self) -> None:
         luggage = self.move.luggage
         arrival = self._arrival = RecordedArrival(self.cell, self._place)
-        await arrival.is_up(self.move, arrival.begin_recorded(suspended=luggage.suspended, trap_exits=luggage.traps))
+        began = arrival.begin_recorded(
+            suspended=luggage.suspended, trap_exits=luggage.traps, was_left=luggage.was_left
+        )  # fmt: skip
+        await arrival.is_up(self.move, began)
 
     def take_over(self) -> list[Item]:
         assert self._arrival is not None
@@ -307,7 +310,9 @@ class RecordedArrival(Arrival):
         self._life: Life | None = None
         self._home: ArrivingHome | None = None
 
-    def begin_recorded(self, *, suspended: bool, trap_exits: bool = False) -> asyncio.Future[None]:
+    def begin_recorded(
+        self, *, suspended: bool, trap_exits: bool = False, was_left: bool = True
+    ) -> asyncio.Future[None]:
         """Restore and replay; the future ends when the life is live."""
         cell, owner, start = self.cell, self._place.home, self.cell.extra().start
         assert start is not None
@@ -317,7 +322,7 @@ class RecordedArrival(Arrival):
         home = self._home = ArrivingHome(owner, cell, self.other, up)
         owner.page = owner.homes.page(switch)
         life = self._life = Life(self.other, home, owner.method, owner.page)
-        life.stage.begins_suspended = suspended
+        life.stage.begins_suspended, life.stage.was_left = suspended, was_left
         for record in switch.restore_records():
             life.to_life(record)
         self.other.ended().add_done_callback(lambda done: home.fail(StartFailed(cell.path, str(done.result()))))

@@ -22,22 +22,34 @@ class SnapshotReceiver:
         self._home = home
         self._pieces: list[bytes] = []
         self.becomes: Start[Any] | None = None  # with what the next lives begin once its class's state has come
+        self._is_ahead = False  # of the life, which does not know yet that its state is another one
         self.unsaved: list[str] = []  # why, for each state put in place from outside that could not be kept
 
     def cancel(self) -> None:
         """The life is over: what has come of it will not be complete."""
+        self._is_ahead = False
         self._pieces.clear()
         self._home.images.cancel()
+
+    def take_ahead(self, records: list[Snapshot]) -> None:
+        """Take what the present life will be told to go on with. What it saves before it is, is of no use any more."""
+        self.cancel()
+        for record in records:
+            self.take(record)
+        self._is_ahead = bool(records)
 
     def take(self, record: Snapshot) -> None:
         """One more piece, or an image; the last piece completes it."""
         home = self._home
+        if self._is_ahead and not record.is_replaced:
+            return
         if record.image is not None:
             home.images.take(record, record.image)
             return
         self._pieces.append(record.data)
         if not record.is_last:
             return
+        self._is_ahead = False
         state = b"".join(self._pieces)
         self._pieces.clear()
         try:

@@ -260,6 +260,8 @@ class LogSink:
         if left_out is None:
             return
         level, fields = WRITTEN[kind][0], {**said, "system": self._system}
+        if said.get("problems"):  # of a transaction that has come into force
+            level = logging.WARNING
         fields.pop("is_logged", None)
         if kind is not LogLine:  # What a program prints is its own affair.
             fields = {key: one.translate(SHOWN) if isinstance(one, str) else one for key, one in fields.items()}

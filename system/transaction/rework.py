@@ -7,17 +7,17 @@ tried, or, if the transaction is given up, as before: it has handled nothing in 
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import msgspec
 
 from ...actors.control.orders import Conclude, Order, Prepare, ReplaceCode, ReplaceState, Resume, Suspend, next_start
 from ...actors.control.orders_lane import order
-from ...actors.errors import ActorStopped, AskFailed, ControlFailed, NotSuspended
+from ...actors.errors import ActorStopped, AskFailed, ControlFailed, HoldfastError, NotSuspended
 from ...actors.events import ActorResumed, ActorSuspended
 from ...actors.kernel import mailbox
 from ...actors.kernel.actor import Start
-from ...actors.kernel.cell import Cell
+from ...actors.kernel.cell import Cell, Host
 from ...actors.migration.quiesce import ATTEMPTS
 from ...actors.process.wire.start_codec import unpack_recipe
 from ...checkpoint.home.recorded_home import give_other_code, switch_of, why_in_vain
@@ -31,6 +31,7 @@ from .operation import PROTECTED, StagedWork, wrong
 from .relocation import seen
 
 if TYPE_CHECKING:
+    from ...checkpoint.home.switch import Switch
     from ..system import ActorSystem
     from .draft import DraftPlace
 
@@ -56,7 +57,7 @@ class Rework(StagedWork):
         self.suspended: bool | None = None
         """Whether it is to be suspended; None: as it is."""
         self._attempt = next(ATTEMPTS)
-        self._held: tuple[Cell, int] | None = None  # where, and which life there
+        self._held: LifeThere | None = None  # the life that has prepared
         self._recipe: bytes | None = None  # of the next lives, from another process
         self._saved: list[bytes] = []  # and the new state, as its home is to keep it
         self._concluded: asyncio.Future[Any] | None = None  # there
@@ -105,7 +106,7 @@ class Rework(StagedWork):
                 self._trouble = f"{cell.path}: {ended_too_often(self._lives_ended)}"
                 await asyncio.sleep(AGAIN_AFTER)  # Its life has ended: the next one is prepared, if there is one.
                 continue
-            self._held = (cell, cell.life)
+            self._held = life_at(cell)
             return
 
     async def _prepared(self, system: ActorSystem, cell: Cell) -> tuple[bytes | None, list[bytes]]:
@@ -163,22 +164,35 @@ class Rework(StagedWork):
             hold = mailbox.held(cell)
             is_held = hold is not None and hold.attempt == self._attempt
         else:
-            is_held = self._held == (cell, cell.life) and cell.host.is_up(cell)
+            switch = switch_of(cell)
+            is_held = self._is_there(cell) and (switch is None or switch.life.counts)
         return "" if is_held else f"{cell.path} has begun a new life"
 
+    def _is_there(self, cell: Cell) -> bool:
+        """Whether the life that was prepared lives still, as far as is known here."""
+        return self._held == life_at(cell) and cell.host.is_up(cell)
+
     def commit(self, system: ActorSystem) -> None:
-        """It goes on with what it has prepared: here at once; elsewhere as soon as it hears so, before all else."""
+        """It goes on with what it has prepared: here at once; elsewhere as soon as it hears so, before all else.
+
+        Raises:
+            ControlFailed: what it has prepared could not be kept, and it goes on as before.
+        """
         cell = self._place.living(system._node)
         if self._is_ordered:
             if self.suspended is not None:
                 self._tell(cell, Suspend() if self.suspended else Resume())
                 self._report(cell)
             return
-        self._put_recipe(cell)
-        switch = switch_of(cell)
-        if switch is not None and not lives_here(cell):  # Its process keeps it again when it hears of it, and may die.
-            for piece in self._saved:
-                switch.from_life(SNAPSHOT.decode(piece))
+        switch, start = switch_of(cell), self._next_start(cell)
+        if switch is not None and start is not None:
+            switch.arrival.becomes = start  # Its snapshot is of the new class.
+        if not lives_here(cell):
+            try:
+                self._keep(cell, start)
+            except ControlFailed:
+                self._tell(cell, Conclude(self._attempt, False, None))
+                raise
         self._tell(cell, Conclude(self._attempt, True, self.suspended))
         self._report(cell)
 
@@ -186,19 +200,25 @@ class Rework(StagedWork):
         if self.suspended is not None:
             cell.node.emit((ActorSuspended if self.suspended else ActorResumed)(cell.path, author()))
 
-    def _put_recipe(self, cell: Cell) -> None:
-        """The next lives begin as the new class, wherever the actor is."""
-        switch = switch_of(cell)
-        if lives_here(cell):
-            hold = mailbox.held(cell)
-            start = hold.prepared.start if hold is not None and hold.prepared is not None else None
-        else:
-            start = None if self._recipe is None else unpack_recipe(self._recipe, imports=False)
-        if start is None:
-            return
-        if switch is not None:
-            switch.arrival.becomes = start  # Its snapshot is of the new class.
+    def _next_start(self, cell: Cell) -> Start[Any] | None:
+        """The recipe of its next lives; None: it is as before."""
         if not lives_here(cell):
+            return None if self._recipe is None else unpack_recipe(self._recipe, imports=False)
+        hold = mailbox.held(cell)
+        return hold.prepared.start if hold is not None and hold.prepared is not None else None
+
+    def _keep(self, cell: Cell, start: Start[Any] | None) -> None:
+        """Have the next lives begin with what a life elsewhere has prepared: it may end before it hears of it.
+
+        Raises:
+            ControlFailed: the state could not be kept, and they begin as before.
+        """
+        switch = switch_of(cell)
+        if switch is not None:
+            before = len(switch.arrival.unsaved)
+            switch.arrival.take_ahead([SNAPSHOT.decode(piece) for piece in self._saved])
+            refuse_unsaved(cell, switch, before)
+        if start is not None:
             self._known_as(cell, start)
 
     @staticmethod
@@ -227,7 +247,11 @@ class Rework(StagedWork):
         self._let_go()
 
     async def finish(self, system: ActorSystem) -> None:
-        """Wait until an actor in another process has heard it."""
+        """Wait until an actor in another process has heard it.
+
+        What is in force is what its home keeps and its spec says, and the next life begins with that. So a life that
+        cannot go on with it is ended.
+        """
         if self._concluded is None:
             return
         cell = self._place.living(system._node)
@@ -235,13 +259,14 @@ class Rework(StagedWork):
         before = 0 if switch is None else len(switch.arrival.unsaved)
         try:
             await asyncio.shield(self._concluded)
-        except (AskFailed, ActorStopped, NotSuspended):
-            # That life has ended, as any may: the next one has what its home keeps, and begins as its spec says.
-            if self._held == (cell, cell.life) and cell.host.is_up(cell):
+        except HoldfastError as error:
+            if self._is_there(cell):
+                end_life(cell)
                 raise
-        if switch is not None and len(switch.arrival.unsaved) > before:
-            problem = f"the new state could not be saved ({switch.arrival.unsaved[-1]})"
-            raise ControlFailed(cell.path, "replace_state", problem)
+            if not isinstance(error, (AskFailed, ActorStopped, NotSuspended)):
+                raise
+        if switch is not None:
+            refuse_unsaved(cell, switch, before)
 
     async def release(self, system: ActorSystem) -> None:
         """It goes on as before."""
@@ -265,6 +290,30 @@ class Rework(StagedWork):
             if cell is not None:
                 self._over(cell)
             self._let_go()
+
+
+LifeThere: TypeAlias = "tuple[Cell, int, Host]"
+"""A life: where, which one there, and in which process or task, for it may be carried over from one to another."""
+
+
+def life_at(cell: Cell) -> LifeThere:
+    """The present life of an actor."""
+    return cell, cell.life, cell.host
+
+
+def end_life(cell: Cell) -> None:
+    """Have the next life begin at once: this one is not as it has to be, and nothing that it says counts."""
+    switch = switch_of(cell)
+    if switch is not None:
+        switch.life.is_void = True
+    cell.kill()
+
+
+def refuse_unsaved(cell: Cell, switch: Switch, known: int) -> None:
+    """Raises ControlFailed: more states than these could not be saved."""
+    if len(switch.arrival.unsaved) > known:
+        problem = f"the new state could not be saved ({switch.arrival.unsaved[-1]})"
+        raise ControlFailed(cell.path, "replace_state", problem)
 
 
 def lives_here(cell: Cell) -> bool:

@@ -16,6 +16,7 @@ KILLS = "tests/checkpoint/test_kill_counts.py"
 
 RACES = "tests/effects/test_races.py"
 RACE_PROGRAMS = "tests/effects/test_race_programs.py"
+CHANGES = "tests/effects/test_changes_of_races.py"
 TIMERS = "tests/effects/test_timers_while_resting.py"
 IN_HAND = "tests/checkpoint/test_diverging_in_hand.py"
 
@@ -899,6 +900,20 @@ CHECKS = {
         "tests/effects/test_long_waits.py",
         "test_what_is_told_to_somebody_who_is_not_started",
     ),
+    "an actor is changed behind a turn in which its last life has ended": Check(
+        "checkpoint/life/recorded_context.py",
+        "self._owes_turn and isinstance",
+        "False and isinstance",
+        CHANGES,
+        "life_ended",
+    ),
+    "what was saved before a change is known does not count behind it": Check(
+        "checkpoint/snapshot/snapshot_receiver.py",
+        "self._is_ahead = bool(records)",
+        "self._is_ahead = False",
+        CHANGES,
+        "state_saved",
+    ),
     "an outcome counts of an effect that is out only": Check(
         "checkpoint/home/pending_asks.py",
         "        if is_out and place not in self.asks:\n",
@@ -964,8 +979,8 @@ CHECKS = {
     ),
     "a turn that waits for a message no more rests no longer": Check(
         "checkpoint/life/recorded_context.py",
-        "            self._over_soon()\n        return super().cancel(msg)\n",
-        "            pass\n        return super().cancel(msg)\n",
+        "            self._life.waits.rested()  #",
+        "            pass  #",
         "tests/effects/test_waiting_turns.py",
         "test_a_turn_that_goes_on_rests_no_longer and gave",
     ),

@@ -215,3 +215,76 @@ async def test_what_the_turn_had_changed_so_far_is_not_kept(tmp_path: Path, isol
         await waits(system, ref.path)
         await ref.ask(test_glances.Word("a"), IN_TIME)
         assert await asked == ["begun", "a"]
+
+
+class Wins(hf.Message):
+    """Race an effect, which takes so many seconds, with a Call; what comes first is published."""
+
+    seconds: float
+
+
+class Won(hf.Message):
+    by: str
+
+
+class Who(hf.Message[str]): ...
+
+
+async def worked(seconds: float) -> float:
+    await asyncio.sleep(seconds)
+    return seconds
+
+
+class Racing(hf.Actor):
+    name = "old"
+
+    def __init__(self) -> None:
+        self.won = 0
+
+    @hf.on(Wins)
+    async def race(self, message: Wins) -> None:
+        both: list[asyncio.Future[Any]] = [self.ctx.effect(worked, message.seconds), self.ctx.wait_for(Call)]
+        _, rest = await asyncio.wait(both, return_when=asyncio.FIRST_COMPLETED)
+        for one in rest:
+            one.cancel()
+        self.won += 1
+        await self.ctx.publish("/won", Won(self.name))
+
+    @hf.on(Count)
+    def count(self, message: Count) -> int:
+        return self.won
+
+    @hf.on(Who)
+    def who(self, message: Who) -> str:
+        return self.name
+
+
+class RacingOn(Racing):
+    name = "new"
+
+
+def ten_more(state: dict[str, Any]) -> dict[str, Any]:
+    return {**state, "won": state["won"] + 10}
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_a_turn_that_ends_by_itself_while_it_is_to_be_left_ends_once(tmp_path: Path, isolation: Any) -> None:
+    """The life that has obeyed is the one that goes on, at whatever moment the effect comes."""
+    async with running(tmp_path, "os") as system:
+        stream = system.events()
+        for number, seconds in enumerate((0.02, 0.05, 0.1, 0.2)):
+            name = f"racing{number}"
+            spec = hf.child(name, hf.start(Racing), isolation=isolation, recovery=hf.hybrid(interval=60.0))
+            ref = await system.start(spec)
+            ref.tell(Wins(seconds))
+            await waits(system, ref.path)
+            async with system.transaction(timeout=20) as change:
+                change.replace_code(ref, RacingOn)
+                change.replace_state(ref, ten_more)
+            committed = [one for one in stream.take() if isinstance(one, hf.events.TransactionCommitted)]
+            assert [one.problems for one in committed] == [()]
+            for is_next in (False, True):
+                if is_next:
+                    await end_of(system, isolation, ref.path)
+                assert await ref.ask(Who(), IN_TIME) == "new"
+                assert await ref.ask(Count(), IN_TIME) == 11

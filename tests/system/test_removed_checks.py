@@ -28,6 +28,7 @@ FAR_NAMED = "tests/control/test_far_names.py"
 SLOW = "tests/supervision/test_slow_restarts.py"
 UPGRADE = "tests/system/upgrade/test_check_upgrade.py"
 COLLECTIONS = "tests/system/test_full_collections.py"
+CHANGES = "tests/effects/test_changes_of_races.py"
 ORDERS = "tests/effects/test_orders_while_resting.py"
 RESTING = "tests/effects/test_moves_while_resting.py"
 CIRCLES = "tests/actors/test_circles.py"
@@ -50,6 +51,13 @@ UNCODABLE = "tests/system/test_uncodable.py"
 SHUTDOWN = "tests/supervision/test_shutdown.py"
 
 CHECKS = {
+    "the life that has obeyed an order is the one that goes on": Check(
+        "system/live_moves.py",
+        "        future.add_done_callback(lambda done: gate.close())  # Who has obeyed goes on.\n",
+        "",
+        CHANGES,
+        "turn_ended",
+    ),
     "who has given orders to others does not go into a process": Check(
         "system/transaction/transaction.py",
         "            look_at_grants(change.operations)\n",
@@ -626,8 +634,8 @@ CHECKS = {
     ),
     "the home keeps the new state though its process has not heard of it": Check(
         "system/transaction/rework.py",
-        "            for piece in self._saved:\n                switch.from_life(SNAPSHOT.decode(piece))\n",
-        "            pass\n",
+        "switch.arrival.take_ahead([SNAPSHOT.decode(piece) for piece in self._saved])",
+        "pass",
         COMMIT,
         "test_a_root_that_is_killed and finish and process",
     ),
