@@ -439,18 +439,28 @@ def test_a_strategy_that_there_is_not_is_refused(options: dict[str, Any]) -> Non
         simulate(restart_order, **options)
 
 
-def test_no_order_of_a_set_changes_a_run() -> None:
-    """Strings have other hashes in each process."""
-    player = Path(__file__).with_name("hash_player.py")
+def in_two_processes(player: str) -> list[list[str]]:
+    """What a program prints where strings have other hashes."""
     runs = [
         subprocess.Popen(
-            [sys.executable, str(player)],
+            [sys.executable, str(Path(__file__).with_name(player))],
             env={**os.environ, "PYTHONHASHSEED": seed, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
             stdout=subprocess.PIPE,
         )
         for seed in ("1", "2")
     ]
-    first, again = (run.communicate(timeout=120)[0].decode().splitlines() for run in runs)
+    printed = [run.communicate(timeout=120)[0].decode().splitlines() for run in runs]
     assert [run.returncode for run in runs] == [0, 0]
+    return printed
+
+
+def test_no_order_of_a_set_changes_a_run() -> None:
+    first, again = in_two_processes("hash_player.py")
     assert len(first) > 1000
     assert first == again
+
+
+def test_a_set_of_refs_has_one_order_in_every_process() -> None:
+    first, again = in_two_processes("refs_player.py")
+    assert first == again
+    assert first[1] == "True"
