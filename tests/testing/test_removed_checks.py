@@ -11,6 +11,8 @@ from tests.removing import Check, as_tests
 GUARD = "tests/testing/test_guard.py"
 PLUGIN = "tests/testing/test_plugin.py"
 LOOPS = "tests/testing/test_loop_methods.py"
+REPLAYS = "tests/testing/schedules/test_replays.py"
+ESCAPES = "tests/testing/schedules/test_escapes.py"
 
 CHECKS = {
     "a turn has time between two outcomes": Check(
@@ -110,6 +112,48 @@ CHECKS = {
         "",
         PLUGIN,
         "test_a_leak_fails_the_test",
+    ),
+    "a test that is refused spoils no other": Check(
+        "testing/plugin.py",
+        "        put.func = _raising(refused)  # Where the fixture is made: pytest has to see that it was begun.\n",
+        "        raise refused\n",
+        PLUGIN,
+        "test_a_test_that_is_refused_spoils_no_other",
+    ),
+    "a schedule is repeated under its own hash seed": Check(
+        "testing/simulation.py",
+        "            require_hash_seed(said, self._command())\n",
+        "",
+        REPLAYS,
+        "test_a_schedule_is_repeated_under_its_hash_seed_only",
+    ),
+    "what fails in another process stays kept": Check(
+        "testing/simulation.py",
+        "            if found in (None, RANDOM, here()):\n",
+        "            if True:\n",
+        REPLAYS,
+        "test_a_kept_failure_that_passes_under_another",
+    ),
+    "names that were imported follow the world": Check(
+        "testing/schedules/world.py",
+        "        self._swaps.follow(self._names.functions)\n",
+        "",
+        ESCAPES,
+        "test_what_a_module_has_by_name",
+    ),
+    "generators made at import are the seed's": Check(
+        "testing/schedules/world.py",
+        "        self._generators.put()\n",
+        "        self._generators = OwnStates((), 0)\n",
+        ESCAPES,
+        "test_what_a_module_has_by_name",
+    ),
+    "a set of refs has one order": Check(
+        "actors/kernel/ref.py",
+        "            found = self._hash = hash_of_address(self._cell.path)\n",
+        "            found = self._hash = hash(self._cell.path)\n",
+        "tests/testing/schedules/test_schedules.py",
+        "test_a_set_of_refs",
     ),
 }
 
