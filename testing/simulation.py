@@ -75,6 +75,7 @@ from .schedules.processes import SimulatedWorkers
 from .schedules.shrinking import shrink
 from .schedules.strategies import DEPTH, mixed
 from .schedules.strategies import strategy as strategy_of
+from .schedules.time_limits import TimeLimit, is_of_time_limit
 from .schedules.turn_log import TurnLog
 from .schedules.world import EPOCH, World
 from .swaps import Swaps
@@ -196,6 +197,12 @@ class Simulation:
         elif self.world is not None:
             root.system.read_along(self.world.look_for_addresses)
         return root
+
+    def told_of_its_end(self) -> None:
+        """The test has heard that its time is over, if it is: what follows may go on to the end of its system."""
+        loop = asyncio.get_running_loop()
+        if isinstance(loop, ControlledLoop):
+            loop.end_by(None)
 
     async def end(self, kind: Any = None, error: Any = None, trace: Any = None) -> None:
         """End the system that lives."""
@@ -607,10 +614,21 @@ class ScheduleSearch:
         try:
             return self._run(choices, looks=looks)
         except BaseException as error:
+            if is_of_time_limit(error):
+                error.add_note(
+                    f"its time was over in the run of seed {choices.seed}, which is neither made again nor shrunk"
+                )
             if not _is_failure(error):
                 raise
             failure = error
-        raise self._explained(failure)
+        try:
+            explained = self._explained(failure)
+        except BaseException as error:
+            if not is_of_time_limit(error):
+                raise
+            failure.add_note(f"the time of the test was over before this failure, of seed {choices.seed}, was shrunk")
+            explained = failure
+        raise explained
 
     def _explained(self, failure: BaseException) -> BaseException:
         """The failure of the shortest schedule that shows it, with a note; or that it cannot be repeated."""
@@ -749,7 +767,7 @@ def _is_failure(error: BaseException) -> bool:
     """Whether it is the outcome of a run, and not the wish to end the test."""
     pytest = sys.modules.get("pytest")
     failed = (Exception,) if pytest is None else (Exception, pytest.fail.Exception)
-    return isinstance(error, failed) and hasattr(error, "__simulation__")
+    return isinstance(error, failed) and hasattr(error, "__simulation__") and not is_of_time_limit(error)
 
 
 def _kind(error: BaseException) -> tuple[object, ...]:
@@ -829,7 +847,10 @@ def run_schedule(
     simulation = Simulation(choices, latency, sync)
     try:
         with asyncio.Runner(loop_factory=functools.partial(ControlledLoop, ticks=ticks)) as runner:
-            runner.run(_run(test, simulation, own, options, recorder, looks))
+            loop = runner.get_loop()
+            assert isinstance(loop, ControlledLoop)
+            with TimeLimit(loop):
+                runner.run(_run(test, simulation, own, options, recorder, looks))
     except BaseException as error:
         error.__simulation__ = simulation  # type: ignore[attr-defined]
         raise
@@ -877,6 +898,7 @@ async def _run(
                     simulation.stop_recording()
                     simulation.choices.end()
             except BaseException:
+                simulation.told_of_its_end()
                 await simulation.end(*sys.exc_info())
                 raise
             await simulation.end()
