@@ -1,4 +1,4 @@
-"""Time limits of pytest-timeout, whose signal strikes in whatever runs just then: a callback of the loop, an actor's turn.
+"""Time limits of pytest-timeout, whose signal strikes in whatever runs just then: a callback, an actor's turn.
 
 asyncio and actors live on after what such code raises. The run has to end all the same, and it is no failure of the
 program: nothing is made again or shrunk.
