@@ -12,6 +12,7 @@ GUARD = "tests/testing/test_guard.py"
 PLUGIN = "tests/testing/test_plugin.py"
 LOOPS = "tests/testing/test_loop_methods.py"
 REPLAYS = "tests/testing/schedules/test_replays.py"
+SCHEDULES = "tests/testing/schedules/test_schedules.py"
 ESCAPES = "tests/testing/schedules/test_escapes.py"
 
 CHECKS = {
@@ -183,11 +184,46 @@ CHECKS = {
         "tests/testing/test_plugins_together.py",
         "test_a_time_limit_is_no_failure",
     ),
+    "priorities fall at their moments": Check(
+        "testing/schedules/strategies.py",
+        "        falls_to = self._changes.pop(self.steps, None)\n",
+        "        falls_to = None\n",
+        SCHEDULES,
+        "test_priorities_that_change",
+    ),
+    "pct learns how long a run is": Check(
+        "testing/schedules/strategies.py",
+        "        self._length = max(self._length, choices.steps, 1)\n",
+        "        self._length = 2**LONG\n",
+        SCHEDULES,
+        "test_priorities_that_change",
+    ),
+    "coverage builds on what was new": Check(
+        "testing/schedules/strategies.py",
+        "            self._corpus.append(choices.kept())\n",
+        "            pass\n",
+        SCHEDULES,
+        "test_what_was_new_is_built_on",
+    ),
+    "what has failed is tried first": Check(
+        "testing/simulation.py",
+        "        passed = self._try_kept() if self._settings.seed is None and len(said) > 1 else []\n",
+        "        passed = list[str]()\n",
+        REPLAYS,
+        "test_what_has_failed_is_tried_first",
+    ),
+    "a profile has its number": Check(
+        "testing/simulation.py",
+        'NIGHTLY if wanted.option("profile") == "nightly" else 1',
+        "1",
+        REPLAYS,
+        "test_a_profile_has_its_number",
+    ),
     "a set of refs has one order": Check(
         "actors/kernel/ref.py",
         "            found = self._hash = hash_of_address(self._cell.path)\n",
         "            found = self._hash = hash(self._cell.path)\n",
-        "tests/testing/schedules/test_schedules.py",
+        SCHEDULES,
         "test_a_set_of_refs",
     ),
 }

@@ -165,3 +165,41 @@ def test_a_kept_failure_that_passes_under_another_hash_seed_stays(pytester: pyte
     under(pytester, "1").assert_outcomes(failed=1)
     under(pytester, "1", mended="yes").assert_outcomes(passed=1)
     under(pytester, "2").assert_outcomes(passed=1)
+
+
+TELLS_ITS_SEEDS = """
+from pathlib import Path
+from holdfast.testing import simulate
+
+@simulate(seeds=5)
+async def test_seeds(system, simulation):
+    with Path("seeds.txt").open("a") as file:
+        print(simulation.seed, file=file)
+    assert simulation.seed != 3
+"""
+
+
+def seeds_run(pytester: pytest.Pytester, *args: str) -> list[int]:
+    """The seeds of a run of the suite, in their order."""
+    pytester.runpytest_inprocess("-p", "no:randomly", "-W", "ignore:the schedule", *args)
+    file = pytester.path / "seeds.txt"
+    seeds = [int(line) for line in file.read_text("utf-8").splitlines()]
+    file.unlink()
+    return seeds
+
+
+def test_what_has_failed_is_tried_first_until_it_passes(pytester: pytest.Pytester) -> None:
+    run_suite(pytester, HEAD + TELLS_ITS_SEEDS, "--collect-only")
+    assert seeds_run(pytester)[:3] == [0, 0, 1]
+    assert {*seeds_run(pytester)} == {3}
+    pytester.makepyfile(HEAD + TELLS_ITS_SEEDS.replace("!= 3", ">= 0"))
+    assert seeds_run(pytester)[:4] == [3, 0, 0, 1]
+    assert seeds_run(pytester)[:3] == [0, 0, 1]
+
+
+@pytest.mark.parametrize(
+    ("args", "count"), [((), 5), (("--holdfast-profile", "ci"), 5), (("--holdfast-profile", "nightly"), 125)]
+)
+def test_a_profile_has_its_number_of_seeds(pytester: pytest.Pytester, args: tuple[str, ...], count: int) -> None:
+    run_suite(pytester, HEAD + TELLS_ITS_SEEDS.replace("!= 3", ">= 0"), "--collect-only")
+    assert {*seeds_run(pytester, *args)} == {*range(count)}
