@@ -124,7 +124,7 @@ def test_priorities_find_an_order_as_often_as_they_promise(count: int) -> None:
 
 
 def test_priorities_that_change_find_what_no_order_of_priorities_shows() -> None:
-    """At least 1 / (n k) of the runs, with n = 3 tasks (the test's is one), and k choices, which the first run tells."""
+    """At least 1 / (n k) of the runs, with n = 3 tasks (the test's is one) and k choices, as the first run tells."""
 
     def hits(depth: int) -> tuple[int, int]:
         tried, found, longest = strategy("pct", depth), 0, 0
