@@ -320,7 +320,9 @@ def test_a_kind_of_leak_that_there_is_not_is_refused(suite) -> None:
 @pytest.mark.holdfast(leaks="sockets")
 async def test_leaks(actor_system): ...
 """)
-    result.stdout.fnmatch_lines(["*'sockets' is none of descriptors, generators, processes, signals, tasks, threads, timers*"])
+    result.stdout.fnmatch_lines(
+        ["*'sockets' is none of descriptors, generators, processes, signals, tasks, threads, timers*"]
+    )
 
 
 EXCEPTIONS = {
