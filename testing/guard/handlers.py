@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import functools
 import signal
-from types import MethodType
+from types import FunctionType, MethodType
 from typing import Any, Final
 
 WATCHED: Final = tuple(
@@ -16,7 +16,7 @@ WATCHED: Final = tuple(
 
 
 def handlers() -> dict[signal.Signals, Any]:
-    """What handles each signal now; that of a runner of asyncio stands for Python's own, in whose place it is."""
+    """What handles each signal now; for what a runner of asyncio or pytest-timeout has put there, what was before."""
     return {number: _own(signal.getsignal(number)) for number in WATCHED}
 
 
@@ -25,4 +25,6 @@ def _own(handler: Any) -> Any:
         method: Any = handler.func
         if isinstance(method, MethodType) and isinstance(method.__self__, asyncio.Runner):
             return signal.default_int_handler
+    if isinstance(handler, FunctionType) and handler.__module__ == "pytest_timeout":
+        return signal.SIG_DFL
     return handler

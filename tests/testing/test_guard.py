@@ -169,7 +169,7 @@ LEAKS = {
 @pytest.mark.parametrize("loops", ["asyncio", "uvloop"])
 @pytest.mark.parametrize("kind", LEAKS)
 def test_each_leak_is_found_and_can_be_allowed(suite, kind: str, loops: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("holdfast.testing.guard.thread_leaks.GRACE", 0.01)
+    monkeypatch.setattr("holdfast.testing.guard.thread_leaks.GRACE", 0.3)
     leak, text = LEAKS[kind]
     allowed = ("timers", "tasks") if kind == "tasks" else (kind,)
     result = suite(
