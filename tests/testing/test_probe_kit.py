@@ -1,6 +1,7 @@
 """Probes as users of other test kits know them: unordered expects, a common limit, autopilot, forward, taps, events."""
 
 import asyncio
+from typing import Any
 
 import pytest
 
@@ -240,7 +241,11 @@ async def test_a_tap_between_two_sees_only_these(actor_system: GuardedSystem, pr
     assert (probe.waiting, await counter.ask(Total())) == ((), 8)
 
 
-PLACES = {"task": {}, "process": {"isolation": "process"}, "recorded": {"recovery": hf.hybrid()}}
+PLACES: dict[str, dict[str, Any]] = {
+    "task": {},
+    "process": {"isolation": "process"},
+    "recorded": {"recovery": hf.hybrid()},
+}
 BOTH = {**PLACES, "recorded process": {**PLACES["process"], **PLACES["recorded"]}}
 
 
@@ -249,8 +254,8 @@ BOTH = {**PLACES, "recorded process": {**PLACES["process"], **PLACES["recorded"]
 async def test_a_tap_sees_what_one_actor_sends_another_wherever_they_live(
     actor_system: GuardedSystem, probe: Probe, by: str, to: str
 ) -> None:
-    sender = await actor_system.start(hf.child("sender", hf.start(Sender), **BOTH[by]))  # type: ignore[arg-type]
-    counter = await actor_system.start(hf.child("counter", hf.start(Counter), **BOTH[to]))  # type: ignore[arg-type]
+    sender = await actor_system.start(hf.child("sender", hf.start(Sender), **BOTH[by]))
+    counter = await actor_system.start(hf.child("counter", hf.start(Counter), **BOTH[to]))
     pair = probe_of(actor_system)
     with probe.tap(counter), pair.tap(sender, counter):
         sender.tell(Order(counter, 7))

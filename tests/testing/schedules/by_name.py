@@ -11,6 +11,8 @@ import numpy
 
 import holdfast as hf
 
+__all__ = ["NEW", "OLD", "OWN", "Look", "Looker", "monotonic", "urandom", "what_time_it_is"]
+
 OWN = random.Random()
 NEW = numpy.random.default_rng()
 OLD = numpy.random.RandomState()
