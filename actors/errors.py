@@ -46,7 +46,7 @@ import inspect
 import string
 from collections.abc import Iterator
 from copy import copy
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Final
 
 from typing_extensions import dataclass_transform
 
@@ -453,6 +453,12 @@ class CannotMove(HoldfastError, text="{actor} cannot be moved: {why}"):
 
     actor: str
     why: str
+
+
+ONLY_MESSAGES: Final = (
+    "only messages go over a connection; send one to an actor there that gives the order, or use the command line"
+)
+"""What to do in place of an order to an actor of another system."""
 
 
 class NotGranted(

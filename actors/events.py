@@ -121,6 +121,21 @@ class ShutdownError(Event, frozen=True, eq=False):
     reason: ExitReason
 
 
+class ActorSuspended(Event, frozen=True, eq=False):
+    """An actor handles no message from now on, by the order of somebody: `by` says who.
+
+    That is the address of an actor, "the program", or "an operator".
+    """
+
+    by: str
+
+
+class ActorResumed(Event, frozen=True, eq=False):
+    """An actor handles messages again, by the order of somebody: `by` says who."""
+
+    by: str
+
+
 class StopOverdue(Event, frozen=True, eq=False):
     """An actor has not ended in the time that those below it have for it, and is killed with all of them.
 
@@ -464,6 +479,22 @@ class TurnWaits(Event, frozen=True, eq=False):
     """
 
     message: str
+    seconds: float
+    at: str
+
+
+class StopWaits(Event, frozen=True, eq=False):
+    """An actor has been stopping for longer than `watch_waits`, and nothing was cut off.
+
+    Of supervisors that wait for each other the lowest one tells. It is told again as `TurnWaits` is.
+
+    Attributes:
+        waits_for: the address of the child that is to end first; "" if it is its own `on_stop` that takes so long.
+        seconds: that it has taken so far, at least.
+        at: the line of the user's code at which that waits; "" if that is not known.
+    """
+
+    waits_for: str
     seconds: float
     at: str
 

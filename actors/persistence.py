@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Collection
 from typing import Protocol
 
 from .errors import DIVERGED, RAISED_AGAIN, ControlFailed, ReplayDiverged, type_name
@@ -82,6 +83,10 @@ class Keeper(Protocol):
         """
         ...
 
+    def began(self, path: str, listed: Collection[str]) -> None:
+        """The supervisor at `path` begins with these children: nobody else is brought back below it."""
+        ...
+
     def note(self, key: str, value: bytes | None) -> None:
         """Keep a small fact; None forgets it. Raises HoldfastError if the store refused."""
         ...
@@ -127,6 +132,9 @@ class NothingKept:
     def dismissed(self, path: str, *, below: bool, for_good: bool) -> None:
         """Do nothing: nothing waits for a next life."""
 
+    def began(self, path: str, listed: Collection[str]) -> None:
+        """Do nothing: nobody is tied to who has lived before this node."""
+
     def note(self, key: str, value: bytes | None) -> None:
         """Keep a fact until the node ends."""
         self._notes.pop(key, None)
@@ -149,6 +157,11 @@ CHILDREN = "child "
 def child_key(supervisor: str, name: str) -> str:
     """The key of the fact that a supervisor has a child of this name."""
     return f"{CHILDREN}{supervisor}/{name}"
+
+
+def plan_key(supervisor: str) -> str:
+    """The key of the fact what a supervisor has been given while it worked: that of a child without a name."""
+    return child_key(supervisor, "")
 
 
 ENTRIES = "entries "

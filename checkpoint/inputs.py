@@ -56,6 +56,7 @@ class Input(Feed, gc=False, eq=False):
         held: whether it is not as safe yet as it has to be: it must not be fed.
         was_cut: whether a life has ended in its turn.
         was_stashed: whether a turn has put it aside.
+        is_late: whether it is not begun any more: whoever has asked was told so.
     """
 
     ask: Ask | None = None
@@ -65,6 +66,7 @@ class Input(Feed, gc=False, eq=False):
     held: bool = False
     was_cut: bool = False
     was_stashed: bool = False
+    is_late: bool = False
 
     @property
     def size(self) -> int:
@@ -74,6 +76,8 @@ class Input(Feed, gc=False, eq=False):
     @property
     def begins_by(self) -> float:
         """Until when its turn may begin, on the loop's clock (0: always): then whoever has asked has given up."""
+        if self.is_late:
+            return EXPIRED
         return 0.0 if self.ask is None else self.ask.deadline or EXPIRED
 
     def entry(self) -> Entry:

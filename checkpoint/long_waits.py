@@ -97,12 +97,16 @@ class LongWaits:
         """Whether an input is a message that a turn waits for, and nobody has begun it."""
         is_free = source.kind == MESSAGE and source.id != running and not source.held
         is_wanted = is_free and source.name in names.split("|") and source.id not in self._home.ledger.stashed()
-        return is_wanted and not (source.begins_by and self._home.node.clock.is_past(source.begins_by))
+        return is_wanted and not self._is_given_up(source)
+
+    def _is_given_up(self, source: Input) -> bool:
+        """Whether nobody waits any more for what an input was to lead to."""
+        return bool(source.begins_by) and self._home.node.clock.is_past(source.begins_by)
 
     def takes(self, source: Input) -> bool:
         """Whether a message that has come is what a turn waits for; it has it then."""
         place = next((place for place, names in self.wanted.items() if source.name in names.split("|")), None)
-        if place is None or source.kind != MESSAGE:
+        if place is None or source.kind != MESSAGE or self._is_given_up(source):
             return False
         self._take(place, source)
         return True
@@ -167,6 +171,7 @@ class LongWaits:
             return
         for source in sources:
             if source.ask is not None and not source.ask.is_done and self._home.changes_nothing(source):
+                source.ask.started = True
                 home.life.port.to_life(Glance(source.feed()))
 
     def glanced(self, record: Glanced) -> None:

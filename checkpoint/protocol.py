@@ -474,7 +474,8 @@ class AtRoot(msgspec.Struct, array_like=True):
 class Wanted(msgspec.Struct, array_like=True, tag=17):
     """A supervisor in another process wants to start a child whose home is at the root, or that is lived there.
 
-    `bindings` says where those of the child lead, port to address; `register` is the name that its spec gives it.
+    `bindings` says where those of the child lead, port to address; `register` is the name that its spec gives it;
+    `made_up` whether its id was.
     """
 
     number: int
@@ -485,6 +486,7 @@ class Wanted(msgspec.Struct, array_like=True, tag=17):
     at_root: AtRoot | None = None
     bindings: dict[str, str] = {}
     register: GivenName | None = None
+    made_up: bool = False
 
 
 class Closed(msgspec.Struct, array_like=True, tag=18):

@@ -10,21 +10,73 @@ from __future__ import annotations
 from typing import Final
 
 WAITS: Final = 1 << 63
-"""Set while the turn waits for something; the rest is 1 + the number of the input, or 0: none is in hand."""
+"""Set while the turn waits for something; below the flags stands 1 + the number of the input, or 0: there was none."""
+OVER: Final = 1 << 62
+"""Set when that turn counts for nothing that ends the process: it is over, or rests for days."""
+BACK: Final = 1 << 61
+"""Set once an input has begun behind a later one: then the number says nothing about the others."""
+
+
+class TurnWord:
+    """The word, for the life that writes it."""
+
+    __slots__ = ("_back", "_number", "_top", "_words")
+
+    def __init__(self, words: memoryview) -> None:
+        self._words = words
+        self._back = self._number = self._top = 0
+
+    def clear(self) -> None:
+        """A life begins: what stood there is the turn in which an earlier one was killed."""
+        self._words[0] = 0
+
+    def begin(self, key: int) -> None:
+        """The turn of this input begins."""
+        number = self._number = key + 1
+        if number < self._top:
+            self._back = BACK
+        self._top = number
+        self._words[0] = number | self._back
+
+    def mark(self, how: int) -> None:
+        """The last turn that has begun is at work (0), waits, or is over."""
+        self._words[0] = self._number | self._back | how
+
+    def look(self, key: int) -> None:
+        """This input is looked at beside the turn in hand, until `mark`."""
+        self._words[0] = key + 1 | BACK
+
+    @property
+    def how(self) -> int:
+        """How the last turn stands."""
+        return int(self._words[0]) & (WAITS | OVER)
 
 
 def input_of(word: int) -> int:
-    """The input in hand; -1: none."""
-    return (word & ~WAITS) - 1
+    """The input in hand; -1: none.
+
+    >>> [input_of(word) for word in (0, 8, 8 | WAITS, 8 | BACK, 8 | OVER)]
+    [-1, 7, 7, 7, -1]
+    """
+    return -1 if word & OVER else (word & (BACK - 1)) - 1
+
+
+def may_have_begun(word: int, key: int) -> bool:
+    """Whether the turn of an input may have begun in this life, which begins them in order as long as it can.
+
+    >>> [may_have_begun(word, 7) for word in (0, 7, 8, 8 | OVER, 9 | OVER, 7 | OVER, 7 | BACK)]
+    [False, False, True, True, True, False, True]
+    """
+    return bool(word & BACK) or key < word & (BACK - 1)
 
 
 def is_at_work(word: int) -> bool:
     """Whether there is a turn in hand that does not wait.
 
-    >>> [is_at_work(word) for word in (0, 8, 8 | WAITS)]
-    [False, True, False]
+    >>> [is_at_work(word) for word in (0, 8, 8 | WAITS, 8 | OVER)]
+    [False, True, False, False]
     """
-    return 0 < word < WAITS
+    return 0 < word < OVER
 
 
 def blamed(word: int, *, one_works: bool) -> int:

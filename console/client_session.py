@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import os
 import socket
-import time
 from typing import TYPE_CHECKING, Any, assert_never
 
 import msgspec
@@ -272,8 +271,9 @@ class ClientSession:
             return {"events": [], "missed": stream.missed, "is_over": False}
         except StopAsyncIteration:
             return {"events": [], "missed": stream.missed, "is_over": True}
+        now = self._system._node.clock.wall()
         return {
-            "events": [event_words(one) for one in (*first, *stream.take())],
+            "events": [event_words(one, now) for one in (*first, *stream.take())],
             "missed": stream.missed,
             "is_over": False,
         }
@@ -333,9 +333,9 @@ def as_told(change: Change) -> dict[str, Any]:
     return {"steps": steps, "difference": list(change.difference), "lost": list(change.lost)}
 
 
-def event_words(event: Event) -> dict[str, Any]:
+def event_words(event: Event, now: float) -> dict[str, Any]:
     """What a followed actor has done, as plain data."""
-    said: dict[str, Any] = {"at": time.time(), "what": type(event).__name__}
+    said: dict[str, Any] = {"at": now, "what": type(event).__name__}
     if isinstance(event, MessageIn | TurnBegan | TurnEnded | MessageOut):
         message = event.message
         is_text = isinstance(message, str)

@@ -27,6 +27,7 @@ from .generate import (
     has_replicas,
     observers_for,
 )
+from .literals import near
 from .live_limits import LimitsOf, LiveLimits, expecting, observe_bounds
 from .messages import DIAGNOSER, Explained, GetDiagnosis, GetExplanation, GetObserved
 from .model import Declaration, Expectation, History, System
@@ -118,6 +119,7 @@ async def watch(
     *,
     addresses: Mapping[str, str] | None = None,
     limits: LimitsOf | None = None,
+    expect: Iterable[Expectation] = (),
     repair: Stance = "advise",
     policy: Policy | None = None,
     actions: Iterable[RepairAction] = (),
@@ -145,6 +147,8 @@ async def watch(
             `ok(ledger.growth)` is added to the model. A pattern such as `"desk/*"` stands for all components that it
             fits and that have no limits by name; of a generated model those that come later, too. Limits go with an
             actor that is moved.
+        expect: what else holds while components work, such as `Expectation("ok(disk)", ("ledger",))` for an observer
+            of your own. A generated model has it whenever it has all of these components.
         repair: "advise" says what it would do, and keeps the score of whether that would have been right. "ask" has a
             person approve each plan: by `approve`, or by `holdfast repair approve CASE`. "on" repairs: by `actions`
             and, for actors that are supervised, by a restart of the actor; what is dangerous, such as a restart of the
@@ -170,11 +174,11 @@ async def watch(
     Raises:
         ModelError: something is wrong with the model. StartFailed, AlreadyStarted: see `ActorSystem.start`.
         ValueError: there is no such stance of repair, the file of repair is another one, or `limits` name a component
-            that there is not.
+            that there is not; or so does `expect`.
     """
     check_stance(repair)
     generated = await generate(system, seconds=seconds) if model is None else None
-    watchers = [*observers]
+    watchers, expected = [*observers], tuple(expect)
     live = None if generated is None else LiveWiring(generated)
     live_limits = LiveLimits(limits or {})
     reach = Reach("" if system._node.root is None else system._node.root.path, addresses or {})
@@ -185,7 +189,7 @@ async def watch(
         watchers += observers_for(
             generated, window=window, hung_after=hung_after, manner=manner, wiring=live, baselines=baselines
         )
-        completed = functools.partial(_completed, alerts=alerts)
+        completed = functools.partial(_completed, expected=expected, alerts=alerts)
         follower = child("follower", Start(ModelFollower, (live, live_limits, SERVER, completed, reach)))
         options["others"] = (*options.get("others", ()), follower)
     else:
@@ -200,7 +204,8 @@ async def watch(
     heard = where if live is None else live.addresses
     live_limits.check(heard)
     live_limits.use(live_limits.look_again(heard), system._node, heard)
-    declaration = _completed(declaration, heard, live_limits.applied, alerts=alerts)
+    _check_expected(declaration, expected)
+    declaration = _completed(declaration, heard, live_limits.applied, expected=expected, alerts=alerts)
     if limits:
         watchers.append(observe_bounds(live_limits.bounds, heard, manner))
     if alerts:
@@ -215,9 +220,30 @@ async def watch(
     return Watch(started, system._node, where, generated)
 
 
-def _completed(declaration: Declaration, components: Iterable[str], limits: LimitsOf, *, alerts: bool) -> Declaration:
-    """What is added to each model: limits of properties, and that nobody outside complains."""
+def _check_expected(declaration: Declaration, expected: Iterable[Expectation]) -> None:
+    """Refuse a name that no component has. Raises ValueError."""
+    known = {one.name for one in declaration.components}
+    for one in expected:
+        for name in one.of:
+            if name not in known:
+                raise ValueError(
+                    f"{one.atom} is expected of {name!r}, and no component has that name{near(name, known)}"
+                )
+
+
+def _completed(
+    declaration: Declaration,
+    components: Iterable[str],
+    limits: LimitsOf,
+    *,
+    expected: Iterable[Expectation],
+    alerts: bool,
+) -> Declaration:
+    """What is added to each model: limits of properties, what else is expected, and that nobody outside complains."""
     declaration = expecting(declaration, limits)
+    known = {one.name for one in declaration.components}
+    more = tuple(one for one in expected if known.issuperset(one.of))
+    declaration = msgspec.structs.replace(declaration, expectations=(*declaration.expectations, *more))
     return _with_alerts(declaration, components) if alerts else declaration
 
 

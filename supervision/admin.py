@@ -19,10 +19,19 @@ from ..actors.process.wire.start_codec import pack_data, unpack_data
 class AlreadyStarted(
     Refusal, text="child {id!r} runs already, at {ref.path}: use that one, or give the new one another id"
 ):
-    """A child of this id runs already; `ref` is it."""
+    """A child of this id is there already; `ref` is it. `in_vain`: why it cannot be recovered, if that is so."""
 
     id: str
     ref: ActorRef[Any]
+    in_vain: str = ""
+
+    def __str__(self) -> str:
+        if not self.in_vain:
+            return super().__str__()
+        return (
+            f"child {self.id!r} is there, at {self.ref.path}, and cannot be recovered: {self.in_vain}; change the "
+            "template to the class that has recorded it (ChangeSupervisor), then TerminateChild and StartChild"
+        )
 
 
 class AlreadyPresent(
@@ -134,7 +143,7 @@ class StartChild(RuntimeOrder[Any]):
 
     spec: Any = None
     args: tuple[Any, ...] = ()
-    kwargs: dict[str, Any] = msgspec.field(default_factory=dict[str, Any])
+    kwargs: dict[str, Any] = msgspec.field(default_factory=dict)
     id: str | None = None
     fresh: bool = False
     candidate: int = 0
@@ -166,7 +175,7 @@ class RestartChild(RuntimeOrder[Any]):
     a turn that has to be cut off for this did not end, which counts against its message as a death does: so asks
     repair, too, and else nobody's order counts. With `older` it
     begins with its snapshot before the newest; if there is none, one that ran goes on as it was, and the reply is
-    ControlFailed.
+    ControlFailed. With `at_once` one that runs is killed, and not asked to end: it may hear nothing.
     """
 
     id: str
@@ -175,6 +184,7 @@ class RestartChild(RuntimeOrder[Any]):
     unless_parked: bool = False
     older: bool = False
     blames_turn: bool = False
+    at_once: bool = False
 
 
 class DeleteChild(RuntimeOrder[None]):

@@ -23,7 +23,7 @@ from ..actors.errors import HoldfastError
 from ..actors.events import ChildRestarted, Event, SupervisorGaveUp
 from ..actors.kernel.cell import DOWN, ENDING, GONE, Cell
 from ..actors.kernel.node import Node
-from .children import RECOVERING, RESTARTING, STOPPED, UP
+from .children import RECOVERING, RESTARTING, STOPPED, UP, Child
 from .supervisor import Supervisor
 
 SUPERVISOR: Final = "its supervisor"
@@ -273,9 +273,20 @@ def _in_hands(above: Cell | None, name: str) -> InOtherHands | None:
         return InOtherHands(path, OPERATOR, "it was stopped by order") if keeper._is_parked(name) else None
     if child.state != UP:
         return InOtherHands(path, SUPERVISOR, f"it is {'being restarted' if child.state in AGAIN else child.state}")
-    if cell is not None and cell.state in (ENDING, DOWN):
+    if cell is not None and cell.state in (ENDING, DOWN) and not _hangs_in_its_end(child, cell):
         return InOtherHands(path, SUPERVISOR, "it is ending")
     return None
+
+
+def _hangs_in_its_end(child: Child, cell: Cell) -> bool:
+    """Whether it ends by itself, and has waited for something longer than its supervisor gives it to stop.
+
+    Its supervisor has not told it to, and so sets it no limit.
+    """
+    turn = None if cell.more is None else cell.more.turn
+    if cell.state != ENDING or turn is None or isinstance(child.spec.shutdown, str):
+        return False
+    return cell.node.loop.time() - turn.since > child.spec.shutdown
 
 
 def _below(cell: Cell | None) -> Iterator[InOtherHands]:

@@ -13,6 +13,7 @@ from ..actors.events import ChildStopped
 from ..actors.exit_reasons import ExitReason
 from ..actors.kernel.cell import RUNNING, Cell
 from ..actors.kernel.envelope import Item
+from ..actors.persistence import is_in_vain
 from .admin import ChildInfo
 from .spec import ChildSpec
 
@@ -54,6 +55,12 @@ class Child:
     def is_running(self) -> bool:
         """Whether a life is lived there now, or is being brought back."""
         return self.state in (UP, RECOVERING)
+
+    @property
+    def in_vain(self) -> str:
+        """Why the restart for which it waits will fail as the last one did, in words; "" if that is not known."""
+        why = str(self.due) if self.state == RESTARTING and self.due is not None else ""
+        return why if is_in_vain(why) else ""
 
     def info(self, above: str) -> ChildInfo:
         """Describe the child as `WhichChildren` tells of it."""
@@ -252,4 +259,15 @@ class RestartAgain(Item):
     @staticmethod
     def run(actor: Any, item: Any) -> object:
         actor._retry(item.child, item.number, item.reason)
+        return None
+
+
+class StartNow(RestartAgain):
+    """A child that waits for its restart is started now, as its spec says. That is by order, so it does not count."""
+
+    __slots__ = ()
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        actor._start_now(item.child, item.number)
         return None

@@ -21,12 +21,24 @@ from ..actors.exit_reasons import SHUTDOWN, ExitReason
 from ..actors.kernel import lifecycle
 from ..actors.kernel.actor import Start, on
 from ..actors.kernel.cell import DOWN, GONE, Cell
-from ..actors.persistence import child_key
+from ..actors.persistence import child_key, is_in_vain, plan_key
 from ..actors.process.resource_limits import Limits
 from .admin import AlreadyStarted, DeleteChild, MaxChildren, NotSupported, RestartChild, StartChild, opened
 from .awaited import EACH_LOOK, LOOK_AGAIN, TELL_AFTER, lives, not_there, tell_wait
-from .children import STARTING, Child, StartRow, complete, expect, tell_ended_with
-from .noted import FIELDS, Noted, OfTemplate, filled, first_noted, pack_noted, renewed, unpack_noted
+from .children import RESTARTING, STARTING, Child, StartRow, complete, expect, tell_ended_with
+from .noted import (
+    FIELDS,
+    Noted,
+    OfTemplate,
+    filled,
+    first_noted,
+    noted_plan,
+    pack_noted,
+    pack_plan,
+    renewed,
+    unpack_noted,
+)
+from .respec import respec
 from .rules import Rule
 from .spec import NAMELESS, ChildSpec, Flags, Isolation, Plan, Restart, Shutdown, check_spec, child
 from .supervisor import Supervisor, listed_at
@@ -52,8 +64,26 @@ class DynamicSupervisor(Supervisor):
     def _begin(self, plan: Plan) -> None:
         check_dynamic(type_name(type(self)), plan)
         self._count = 0
+        plan = self._in_force(plan)
         super()._begin(Plan.of(plan.flags, ()))
         self._template = plan.children[0] if plan.children else None
+
+    def _in_force(self, declared: Plan) -> Plan:
+        """The plan of this start: with what we were given while we worked, unless our recipe says something newer."""
+        key, keeper = plan_key(self.ctx.path), self.ctx._cell.node.ports.keeper
+        data = keeper.noted(key)
+        if data is None or type(self).init is not Supervisor.init:
+            return declared
+        try:
+            plan = noted_plan(declared, data)
+            left = pack_plan(declared, plan)
+            if left != data:
+                keeper.note(key, left)
+        except HoldfastError as error:  # It stays in the journal: perhaps its class is only not there today.
+            why = f"what it was given while it worked cannot be had any more, so it begins as described: {error}"
+            self.ctx._cell.node.emit(ChildStartFailed(self.ctx.path, why))
+            return declared
+        return plan
 
     async def _start_all(self) -> None:
         """Start empty, or with the children that were there before, if there is a journal of them."""
@@ -61,8 +91,8 @@ class DynamicSupervisor(Supervisor):
         come: list[Child] = []
         for key, data in node.ports.keeper.notes(where).items():
             name = key.removeprefix(where)
-            if "/" in name:
-                continue  # It is the child of a supervisor below us.
+            if not name or "/" in name:
+                continue  # It is our own plan, or the child of a supervisor below us.
             if data == MADE_UP:
                 self._errand(self._lose(name))
                 continue
@@ -74,6 +104,7 @@ class DynamicSupervisor(Supervisor):
             except HoldfastError as error:  # It stays in the journal: perhaps its class is only not there today.
                 node.emit(ChildStartFailed(f"{self.ctx.path}/{name}", str(error)))
         self._children.update((one.spec.id, one) for one in come)
+        self._tell_begun()
         self._expect(come)
         waiting = await self._come_back(come)
         if waiting:
@@ -176,6 +207,28 @@ class DynamicSupervisor(Supervisor):
         if self._flags.journal and self._is_in_place:
             self._try_to_note(one, note)
 
+    def _retry(self, one: Child, number: int, reason: ExitReason) -> None:
+        if number == one.retry and one.state == RESTARTING and is_in_vain(str(reason)):
+            self._renew(one)
+        super()._retry(one, number, reason)
+
+    def _renew(self, one: Child) -> None:
+        """A child whose code does not fit what is recorded of it is tried with that of the present template."""
+        if not isinstance(one.noted, OfTemplate) or self._template is None:
+            return
+        try:
+            start = one.noted.spec(self._template, one.spec.id, made_up=one.spec.made_up).start
+        except HoldfastError:
+            return  # Its arguments do not fit that one: it is tried as it is.
+        if start.kind is one.spec.start.kind:
+            return
+        if one.cell is not None and one.cell.state is not GONE:
+            one.cell.table = start.kind._table
+            respec(one.cell, start)
+        else:
+            before, one.spec = one.spec, dataclasses.replace(one.spec, start=start)
+            self._respecified(one, before)
+
     def _try_to_note(self, one: Child, note: Callable[[], None]) -> None:
         """A child has come, or gone, whatever the store says."""
         try:
@@ -220,6 +273,29 @@ class DynamicSupervisor(Supervisor):
         """New flags and template; those who live now stay as they are, even if there are more than there may be."""
         check_dynamic(self.ctx.path, plan)
         self._flags, self._template = plan.flags, plan.children[0] if plan.children else None
+
+    def _keep_plan(self, plan: Plan, *, has_children: bool) -> None:
+        """With a journal it is noted, as the children are that it is for; else our recipe says it."""
+        if not self._note_plan(plan):
+            super()._keep_plan(plan, has_children=has_children)
+
+    def _note_plan(self, plan: Plan) -> bool:
+        """Note what we were given and our recipe does not say. False: we have no journal, or it could not be noted."""
+        if type(self).init is not Supervisor.init:
+            return False
+        key, keeper = plan_key(self.ctx.path), self.ctx._cell.node.ports.keeper
+        try:
+            note = pack_plan(self._given, plan) if plan.flags.journal else None
+            if note != keeper.noted(key):
+                keeper.note(key, note)
+        except HoldfastError as error:
+            self.ctx._cell.node.emit(StoreRefused(self.ctx.path, str(error)))
+            return False
+        return plan.flags.journal
+
+    def _set_flags(self, flags: Flags) -> None:
+        super()._set_flags(flags)
+        self._note_plan(Plan.of(flags, self._specs()))
 
     def _recipe_with(self, known: Any, given: tuple[ChildSpec, ...]) -> Any:
         """The template, if there is one."""
@@ -272,7 +348,8 @@ class DynamicSupervisor(Supervisor):
     async def _check_free(self, spec: ChildSpec) -> None:
         known = await self._come_so_far(spec.id)
         if known is not None:
-            raise AlreadyStarted(spec.id, self.ctx._cell.node.cell_at(f"{self.ctx.path}/{spec.id}").ref)
+            ref = self.ctx._cell.node.cell_at(f"{self.ctx.path}/{spec.id}").ref
+            raise AlreadyStarted(spec.id, ref, known.in_vain)
         most = self._flags.max_children
         if most is not None and len(self._children) >= most:
             self.ctx._cell.node.numbers.no_room["children", spec.start.kind] += 1

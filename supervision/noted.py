@@ -3,7 +3,8 @@
 A child that was made of the template comes back as the template says then, with the arguments of its own start and with
 all that was changed of it since. A change says what the template said when it was made: where the template says
 something else by now, that is newer, and counts. What is as in the template again is no change any more. All other
-children are noted whole.
+children are noted whole. A template that the supervisor was given while it worked is a change of the one that its
+recipe says, and noted in the same way; so are its flags.
 
 The mechanism is noted as it was when the child came: what has become of that has notes of its own.
 """
@@ -17,7 +18,7 @@ from typing import Any, TypeAlias
 from ..actors.errors import SpecError, type_name
 from ..actors.kernel.actor import Start
 from ..actors.process.wire.start_codec import pack_data, packed_digest, unpack_data
-from .spec import ChildSpec
+from .spec import ChildSpec, Flags, Plan
 
 Change: TypeAlias = "tuple[bytes, bytes]"
 """What the template said (a digest), and what the child says instead (packed)."""
@@ -25,6 +26,9 @@ Change: TypeAlias = "tuple[bytes, bytes]"
 OWN = ("id", "comes_back", "made_up")
 """The fields of a spec that are a child's own anyway."""
 FIELDS = tuple(field.name for field in dataclasses.fields(ChildSpec) if field.name not in OWN)
+TEMPLATE = "template"
+OF_TEMPLATE = ("id", *FIELDS)
+FLAGS = tuple(field.name for field in dataclasses.fields(Flags))
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -106,6 +110,49 @@ def renewed(known: Noted | None, template: ChildSpec | None, before: ChildSpec, 
     return first_noted(template, dataclasses.replace(base, **now)) if now else base
 
 
+def pack_plan(declared: Plan, now: Plan) -> bytes | None:
+    """What a dynamic supervisor was given and its recipe does not say; None: nothing.
+
+    Raises:
+        HoldfastError: it cannot be stored.
+    """
+    before, after = _parts(declared, now), _parts(now, declared)
+    changes = {
+        name: (_digest(name, said), pack_data(after[name], name))
+        for name, said in before.items()
+        if packed_digest(said, name) != packed_digest(after[name], name)
+    }
+    return pack_data(changes, "what it was given") if changes else None
+
+
+def noted_plan(declared: Plan, data: bytes) -> Plan:
+    """With what a dynamic supervisor begins whose recipe says `declared`.
+
+    Raises:
+        HoldfastError: what it was given cannot be had any more.
+    """
+    parts = {TEMPLATE: declared.children, **_parts(declared, declared)}
+    for name, (before, packed) in unpack_data(data).items():
+        if name in parts and before == _digest(name, parts[name]):
+            parts[name] = unpack_data(packed)
+    flags = Flags(**{name: parts[name] for name in FLAGS})
+    of_template = {name: parts[name] for name in OF_TEMPLATE if name in parts}
+    return Plan.of(flags, [dataclasses.replace(one, **of_template) for one in parts[TEMPLATE]])
+
+
+def _parts(plan: Plan, other: Plan) -> dict[str, Any]:
+    """What may be changed of a plan: its flags, and its template, field by field if the other has one too."""
+    parts: dict[str, Any] = {name: getattr(plan.flags, name) for name in FLAGS}
+    if not (plan.children and other.children):
+        return {**parts, TEMPLATE: plan.children}
+    return {**parts, **{name: getattr(plan.children[0], name) for name in OF_TEMPLATE}}
+
+
+def _digest(name: str, said: Any) -> bytes:
+    """Digest what is said; of a start the class counts."""
+    return packed_digest(type_name(said.kind) if name == "start" else said, name)
+
+
 def pack_noted(known: Noted, spec: ChildSpec) -> bytes:
     """The note. Raises HoldfastError: it cannot be stored."""
     note: Any = known
@@ -148,9 +195,8 @@ def _changed(before: ChildSpec, after: ChildSpec) -> set[str]:
 
 
 def _said(template: ChildSpec, field: str) -> bytes:
-    """What a template says of a field, as a digest; of its start the class counts."""
-    said = getattr(template, field)
-    return packed_digest(type_name(said.kind) if field == "start" else said, field)
+    """What a template says of a field, as a digest."""
+    return _digest(field, getattr(template, field))
 
 
 def _is_added_to(own: Start[Any], start: Start[Any]) -> bool:

@@ -19,15 +19,17 @@ NO_RECIPE = (
 """Why a child that was started by a message, or by an `init` in another process, cannot be placed anew."""
 
 
-def respec(cell: Cell, start: Start[Any]) -> None:
+def respec(cell: Cell, start: Start[Any], *, is_lent: bool = False) -> None:
     """The next lives at `cell` begin with `start`: its own recipe, its supervisor's spec, and the recipes above.
+
+    `is_lent`: to try it only, so that no journal notes it.
 
     Raises:
         SpecError: the child's spec does not allow it.
     """
     spec = dataclasses.replace(cell.spec, start=start) if isinstance(cell.spec, ChildSpec) else cell.spec
     cell.extra().start = start
-    _change(cell, spec, lambda known: dataclasses.replace(known, start=start))
+    _change(cell, spec, lambda known: dataclasses.replace(known, start=start), is_noted=not is_lent)
 
 
 def replace_place(cell: Cell, spec: ChildSpec, *, is_lent: bool = False) -> None:

@@ -27,6 +27,7 @@ from .patience import end_within
 from .rules import Rule
 
 A = TypeVar("A", bound=Actor)
+T = TypeVar("T")
 A_co = TypeVar("A_co", bound=Actor, default=Any, covariant=True)
 
 Restart = Literal["permanent", "transient", "temporary"]
@@ -86,6 +87,11 @@ class Flags:
         check_seconds("supervisor", "period", self.period)
 
 
+def _own(default: T) -> T:
+    """A field that the runtime fills in: the text of a spec leaves it out."""
+    return dataclasses.field(default=default, repr=False)
+
+
 @dataclasses.dataclass(frozen=True, slots=True)
 class ChildSpec(Generic[A_co]):
     """One child: how it starts, when it is restarted, how it is stopped, where it lives. Made by `child`.
@@ -107,11 +113,13 @@ class ChildSpec(Generic[A_co]):
     significant: bool = False
     rules: tuple[Rule, ...] = ()
     mechanism: Any = None
-    comes_back: bool = True  # whether its supervisor starts it again when that has itself been restarted
-    made_up: bool = False  # whether its supervisor has made its id up
+    comes_back: bool = _own(True)  # whether its supervisor starts it again when that has itself been restarted
+    made_up: bool = _own(False)  # whether its supervisor has made its id up
     start_timeout: StartTimeout | None = None  # None becomes what the kind of child has by default
     autostart: bool = True  # whether its supervisor starts it with the others, or only by order
-    late: frozenset[str] = frozenset()  # ports that transactions have bound: whom they lead to may be started later
+    late: frozenset[str] = _own(
+        frozenset()
+    )  # ports that transactions have bound: whom they lead to may be started later
     register: GivenName | None = None  # what each life has beside its address
     scope: dataclasses.InitVar[Scope | None] = None  # of a spec that was stored before, beside a text as `register`
 
@@ -164,7 +172,8 @@ class ChildSpec(Generic[A_co]):
             try:
                 pack_recipe(self.start, where)
             except UnsavableValue as error:
-                raise SpecError(error.where, f"{error.problem} cannot be sent to another process") from error
+                advice = "give plain data, and have `__init__` make the rest of it there"
+                raise SpecError(error.where, f"{error.problem} cannot be sent to another process: {advice}") from error
 
     @property
     def has_home(self) -> bool:

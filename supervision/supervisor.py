@@ -43,6 +43,7 @@ from .children import (
     Child,
     RestartAgain,
     StartLimit,
+    StartNow,
     StartRow,
     begin_start,
     bind_expected,
@@ -175,7 +176,12 @@ class Supervisor(Inquiries):
 
     async def _start_all(self) -> None:
         """Start the children of the plan, or those that there were before."""
+        self._tell_begun()
         await self._start_listed()
+
+    def _tell_begun(self) -> None:
+        """Say which children there are or come back: whoever waits for another one hears that it does not."""
+        self.ctx._cell.node.ports.keeper.began(self.ctx.path, list(self._children))
 
     async def _start_listed(self) -> None:
         """Start the children that are listed."""
@@ -490,6 +496,12 @@ class Supervisor(Inquiries):
         if number == one.retry and one.state == RESTARTING:
             one.due = None
             self._restart(one, reason)
+
+    def _start_now(self, one: Child, number: int) -> None:
+        """As `_retry`, by order."""
+        if number == one.retry and one.state == RESTARTING:
+            one.due = None
+            self._errand(self._bring_back(one, [one]))
 
     def _restart(self, one: Child, reason: ExitReason) -> None:
         """One attempt by the strategy, counted; gives up when there were too many."""
@@ -822,6 +834,8 @@ class Supervisor(Inquiries):
             row = StartRow((one,), RESTARTING)
             if message.blames_turn and one.cell is not None:
                 one.cell.host.home.hangs(one.cell)
+            if message.at_once and one.cell is not None:
+                one.cell.kill()
             await self._stop(one, row=row, by=by, because="it was restarted by order")
             if one.row is not row:  # Whoever has it now says what becomes of it.
                 raise StartFailed(self._path_of(one), "it was stopped, or started by somebody else, meanwhile")
@@ -878,12 +892,10 @@ class Supervisor(Inquiries):
     @on(ChangeSupervisor)
     def _change(self, message: ChangeSupervisor) -> Any:
         """Take new flags and specs; nothing is started or stopped, and nothing changes if they are not valid."""
-        from .respec import keep_plan  # It asks here what a supervisor is.
-
         try:
             plan = new_plan(self, message)
             self._take(plan)
-            keep_plan(self, plan.flags, None if message.children is None else plan.children)
+            self._keep_plan(plan, has_children=message.children is not None or message.flags is None)
         except StartIgnored:
             return None
         except HoldfastError as error:
@@ -933,6 +945,16 @@ class Supervisor(Inquiries):
         children = succession(self, self._children, plan)
         self._flags, self._children = plan.flags, children
 
+    def _set_flags(self, flags: Flags) -> None:
+        """Have other flags from now on; whoever sets them sees to our next lives."""
+        self._flags = flags
+
+    def _keep_plan(self, plan: Plan, *, has_children: bool) -> None:
+        """Have our next lives begin with a plan; without children of its own it leaves those as they are."""
+        from .respec import keep_plan  # It asks here what a supervisor is.
+
+        keep_plan(self, plan.flags, plan.children if has_children else None)
+
     def _recipe_with(self, known: Any, given: tuple[ChildSpec, ...]) -> Any:
         """What our next lives begin with if they are given these specs beside those that are known."""
         names = {spec.id for spec in given}
@@ -951,10 +973,18 @@ def _has_ended_by(one: Child, cause: str) -> bool:
     return reason.common_cause == cause and spec.backoff is None and spec.restarts(reason)
 
 
-def listed_at(cell: Cell) -> dict[str, Child] | None:
+def listed_at(cell: Cell | None) -> dict[str, Child] | None:
     """The children of a supervisor that lives in this process; None if there is none, or it has not begun."""
-    actor = cell.actor
+    actor = None if cell is None else cell.actor
     return actor._listed() if isinstance(actor, Supervisor) and "_children" in actor.__dict__ else None
+
+
+def try_again(cell: Cell) -> None:
+    """Start a child now that waits for its restart, if its supervisor lives in this process."""
+    one = (listed_at(cell.parent) or {}).get(cell.name)
+    if cell.parent is not None and one is not None and one.cell is cell and one.due is not None:
+        one.retry += 1
+        cell.parent.push(StartNow(one, one.retry, one.due))
 
 
 def kill_starting(top: Cell) -> None:

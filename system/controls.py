@@ -33,7 +33,7 @@ from ..actors.errors import (
     SpecError,
     StillEnding,
 )
-from ..actors.events import EventStream
+from ..actors.events import ActorResumed, ActorSuspended, EventStream
 from ..actors.exit_reasons import KILLED, SHUTDOWN, ExitReason
 from ..actors.kernel import lifecycle
 from ..actors.kernel.actor import Actor, Start
@@ -52,6 +52,7 @@ from ..checkpoint.places.far_parent import SlotPlace
 from ..supervision.respec import respec
 from ..supervision.spec import ChildSpec, Isolation
 from ..supervision.supervisor import Supervisor
+from .history.authors import author
 from .history.recorder import HistoryRecorder, expect_end
 from .live_moves import Moves, check_isolation
 from .transaction.errors import TransactionFailed
@@ -96,11 +97,15 @@ class Controls:
 
         It still obeys its supervisor and all control. A suspension ends with the life.
         """
+        cell = self._living(target)
         await self._order(target, Suspend(), timeout)
+        cell.node.emit(ActorSuspended(cell.path, author()))
 
     async def resume(self, target: Target, *, timeout: float = DEFAULT_TIMEOUT) -> None:
         """Have it handle messages again. Twice is once."""
+        cell = self._living(target)
         await self._order(target, Resume(), timeout)
+        cell.node.emit(ActorResumed(cell.path, author()))
 
     async def get_state(self, target: Target, *, timeout: float = DEFAULT_TIMEOUT) -> Any:
         """A copy of an actor's state: what its `get_state()` gives, else a dict of its key variables.

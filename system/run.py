@@ -14,6 +14,7 @@ from time import monotonic
 from typing import Any, TypeVar
 
 from ..actors.errors import SpecError
+from ..actors.kernel.lifecycle import let_go
 from ..actors.process.fork.launch import check_is_program
 from ..actors.seconds import check_seconds
 from ..cluster.leadership import LeadershipLost
@@ -22,6 +23,8 @@ from .init_process import leave_init
 T = TypeVar("T")
 LOOKS = 4
 """How often it is looked whether the loop goes on, within the time that it may stand still."""
+ENDS_WITHIN = 10.0
+"""Seconds for what runs beside the program to end when it is cancelled; then the program ends without it."""
 
 
 class StandstillWatch:
@@ -71,6 +74,18 @@ class StandstillWatch:
         os._exit(128 + number)
 
 
+async def _end_tasks() -> None:
+    """Cancel all that runs beside the program, and let go of what does not end of that."""
+    others = asyncio.all_tasks() - {asyncio.current_task()}
+    for task in others:
+        task.cancel()
+    if others:
+        for task in (await asyncio.wait(others, timeout=ENDS_WITHIN))[1]:
+            print(f"{task.get_name()} was cancelled, and does not end: the program ends without it", file=sys.stderr)
+            task.print_stack(file=sys.stderr)
+            let_go(task)
+
+
 def run(
     main: Coroutine[Any, Any, T] | Callable[[], Coroutine[Any, Any, T]],
     *,
@@ -90,6 +105,9 @@ def run(
     loop stands still for `standstill` seconds from the signal on, all stacks are written to stderr, and the process
     ends at once, as by SIGKILL but with the code of the signal. Code in C that never returns is the exception: Python
     does not learn of the signal then.
+
+    Tasks that are left when the program has returned are cancelled. Whichever has not ended ten seconds later is told
+    on stderr with its stack, and the program ends without it.
 
     Where there is no uvloop it is run on asyncio's own loop. Where loops handle no signals, which is on Windows, SIGINT
     cancels it, too, and SIGTERM ends the process at once.
@@ -153,6 +171,7 @@ def run(
             watch.end()
             for number in handled:
                 loop.remove_signal_handler(number)
+            await _end_tasks()
 
     from ..actors.fast_loop import new_event_loop  # only now: importing holdfast does not import uvloop
 

@@ -125,7 +125,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
         watch_turns: tell (TurnSlow) of turns in this process that occupy the loop for longer than this many seconds.
             For actors in processes see `Limits(hung_after=...)`.
         watch_waits: tell (TurnWaits) of turns, wherever they run, that take longer than this many seconds with all that
-            they wait for. Nothing is ended.
+            they wait for, and (StopWaits) of stops. Nothing is ended.
         recovery_hooks: `recovery_hooks(...)`: what is called before and after the phases of every recovery.
         recovery: a recovery file (its path, or from `load_recovery`): how actors are recovered whose child specs do
             not say, and their key variables.

@@ -13,6 +13,7 @@ import math
 import os
 import selectors
 import sys
+import time
 from collections import deque
 from collections.abc import Callable, Generator
 from concurrent.futures import Executor
@@ -162,6 +163,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
       an end. A thread that waits for a lock, or for a future, is not at work, nor is one that ran before the loop was
       made.
     - Files and sockets are looked at, but the clock does not wait for them while a timer is set.
+    - Unix time passes with it for every system on the loop (`ctx.now()`, waits that outlive a program, histories).
     - Another process has no virtual clock: actors in processes of their own, and subprocesses, are refused
       (`RealTimeNeeded`); test them on a real loop.
     - When nothing can happen any more it raises `NothingToWaitFor` instead of hanging.
@@ -178,8 +180,11 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
     _debug: bool
     _closed: bool
 
-    def __init__(self, start: float = 0.0, *, ticks: int = TICKS, jumps: int = JUMPS) -> None:
+    def __init__(
+        self, start: float = 0.0, *, epoch: float | None = None, ticks: int = TICKS, jumps: int = JUMPS
+    ) -> None:
         self._virtual = _JumpingSelector(self, start, ticks, jumps)
+        self._epoch = time.time() - start if epoch is None else epoch
         self._patient: list[Callable[[str], None]] = []
         super().__init__(self._virtual)
         self._clock_resolution = math.ulp(start)
@@ -187,6 +192,10 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
     def time(self) -> float:
         """Seconds on the virtual clock."""
         return self._virtual.now
+
+    def unix_time(self) -> float:
+        """Seconds since 1970: `epoch` at 0; if that was left out, they were the machine's when the loop was made."""
+        return self._epoch + self._virtual.now
 
     def next_timer(self) -> float:
         """Return when the next timer is due, in seconds on this clock; inf: none is set."""

@@ -77,7 +77,7 @@ from .schedules.strategies import DEPTH, mixed
 from .schedules.strategies import strategy as strategy_of
 from .schedules.time_limits import TimeLimit, is_of_time_limit
 from .schedules.turn_log import TurnLog
-from .schedules.world import EPOCH, World
+from .schedules.world import World
 from .swaps import Swaps
 from .turns import Tracer, watch_turns
 from .wanted import SystemsWanted, running
@@ -188,7 +188,6 @@ class Simulation:
             inside.reset(mark)
         root.node, root.is_up = root.system._node, True
         root.system._body = self._test
-        self._swaps.put(root.node.clock, "wall", lambda: EPOCH + root.node.loop.time())
         pool = root.system._workers
         if isinstance(pool, SimulatedWorkers):
             pool.draw_from(self.choices, self.latency)

@@ -31,6 +31,7 @@ TIME_LIMIT = 60.0  # seconds for all blocks of one document
 FENCE = re.compile(
     r"^(?P<indent> *)(?P<fence>`{3,}|~{3,})(?P<info>[^`\n]*)\n(?P<body>.*?)^(?P=indent)(?P=fence)`* *$", re.M | re.S
 )
+INCLUDED = re.compile(r'--8<-- "(?P<path>examples/[\w./-]+)"\n')
 QUOTATION = re.compile(r"# (?P<path>[\w./-]+\.\w+)\n")
 
 
@@ -178,6 +179,16 @@ def test_blocks_run(document: Path, tmp_path: Path) -> None:
     assert code == 0, output
     unmet = {branch.line for branch in error_branches(text)} - {int(one.name) for one in met.iterdir()}
     assert not unmet, "the errors of these lines were not met"
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_a_block_that_is_not_run_is_a_file_of_the_examples(document: Path) -> None:
+    """As `pymdownx.snippets` includes it: nothing else is shown in a block with a language in braces."""
+    for found in FENCE.finditer(document.read_text("utf-8")):
+        if found["info"].strip().startswith("{"):
+            included = INCLUDED.fullmatch(textwrap.dedent(found["body"]))
+            assert included is not None, f"write ```python, not {found['info']}"
+            assert (ROOT / included["path"]).is_file()
 
 
 def test_blocks_keep_their_lines() -> None:

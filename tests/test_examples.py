@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-OWN_TESTS = {"rescue_robot", "fastapi_service", "quick_start", "chapter_4_store"}
-"""The first prints times, the second serves until it is told to end, the last two are killed."""
+OWN_TESTS = {"rescue_robot", "fastapi_service", "tcp_server", "quick_start", "chapter_4_store"}
+"""The first prints times, two serve until they are told to end, the last two are killed."""
 FOLDER = Path(__file__).parent.parent / "examples"
 EXAMPLES = [
     path for path in sorted([*FOLDER.glob("*.py"), *FOLDER.glob("tutorial/*.py")]) if path.stem not in OWN_TESTS

@@ -1,5 +1,7 @@
 """Looks now and then for turns that have waited for too long, wherever they run; it tells of them, and ends nothing.
 
+A stop is a turn, too: that of a supervisor waits for its children.
+
 Nothing is measured per message: the looks read what the homes of actors know anyway, as those of `why` do, a
 millisecond of the loop at a time.
 """
@@ -13,8 +15,8 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Final
 
 from ..errors import HoldfastError
-from ..events import TurnWaits
-from ..kernel.cell import GONE, Cell
+from ..events import StopWaits, TurnWaits
+from ..kernel.cell import DOWN, ENDING, GONE, Cell
 from .orders import Status
 
 if TYPE_CHECKING:
@@ -50,7 +52,7 @@ class WaitSeen:
 
 
 class WaitWatch:
-    """Tells (TurnWaits) of turns that take longer than a limit with all that they wait for. Off unless it is asked for.
+    """Tells of turns that take longer than a limit with all that they wait for. Off unless it is asked for.
 
     Args:
         node: whose actors.
@@ -104,6 +106,9 @@ class WaitWatch:
         work, before, now = cell.host.work(cell), self._seen.get(cell), self._node.loop.time()
         if not work.is_in_turn or any(rest.kind in RESTS for rest in cell.host.rests(cell)):
             return None
+        child = _stopped_first(cell) if cell.state is ENDING else None
+        if child is not None and child.state is ENDING and child.host.work(child).is_in_turn:
+            return None  # That one tells.
         mark = work.mark, work.since
         if before is not None and before.mark == mark:
             cell.host.ask_turns(cell)  # What its process says is looked at the next time.
@@ -126,6 +131,19 @@ class WaitWatch:
             return
         seen.due = 2.0 * seconds
         seen.look_at = now + seconds
-        if node.events.has_listeners:
-            message, at = ("", "") if status is None else (status.turn or "", status.turn_at)
+        if not node.events.has_listeners:
+            return
+        message, at, state = (
+            ("", "", cell.state) if status is None else (status.turn or "", status.turn_at, status.state)
+        )
+        if state == ENDING:
+            child = _stopped_first(cell)
+            node.emit(StopWaits(cell.path, "" if child is None else child.path, seconds, "" if child else at))
+        else:
             node.emit(TurnWaits(cell.path, message, seconds, at))
+
+
+def _stopped_first(cell: Cell) -> Cell | None:
+    """Which child a cell that ends waits for: they end one by one, the last one first."""
+    living = [child for child in (cell.children or {}).values() if child.state not in (DOWN, GONE)]
+    return next((child for child in living if child.state is ENDING), living[-1] if living else None)

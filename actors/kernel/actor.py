@@ -313,7 +313,7 @@ def _declared_bindings(cls: type) -> frozenset[str]:
     return frozenset(names)
 
 
-class Start(msgspec.Struct, Generic[S], frozen=True):
+class Start(msgspec.Struct, Generic[S], frozen=True, repr_omit_defaults=True):
     """A recipe for a new actor: class and arguments, never a live object. Made by `start`."""
 
     kind: type[S]

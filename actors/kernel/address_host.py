@@ -10,6 +10,7 @@ import asyncio
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
+from ..errors import StartFailed
 from ..events import ActorKilled
 from .cell import RUNNING, TurnRest
 from .envelope import Ask, Item
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from ..exit_reasons import ExitReason
     from ..overflow import Overflow
     from .actor import Start
-    from .cell import Cell, GivenName
+    from .cell import Cell, GivenName, Order
 
 
 class Work(NamedTuple):
@@ -32,6 +33,7 @@ class Work(NamedTuple):
         has_answered: what it has in hand, or had last, is an ask, and whoever made that has an answer.
         own_turns: times its process was seen to have got on, by turns that the home knows nothing of, too (of timers,
             say); it is as new as the last answer to `Home.ask_turns`.
+        newest: the ask that `has_answered` is about, if that is known as such.
     """
 
     mark: object = None
@@ -39,6 +41,7 @@ class Work(NamedTuple):
     since: float | None = None
     has_answered: bool = False
     own_turns: int = 0
+    newest: object = None
 
 
 class Capacity(Protocol):
@@ -62,6 +65,9 @@ class Home:
     def push(self, cell: Cell, item: Item) -> None:
         """Put an item of the runtime's own in its place behind the messages."""
         raise NotImplementedError
+
+    def start_failed(self, error: StartFailed) -> None:
+        """Hear why no life has begun."""
 
     def offer(self, cell: Cell, item: Any) -> Awaitable[None] | None:
         """Admit a message for a sender that waits until it is accepted. None: it is."""
@@ -87,7 +93,7 @@ class Home:
         """What the actor is at; `running` is the number of the input in hand, -1 if none is known."""
         turn, item = cell.more.turn if cell.more is not None else None, cell.item
         has_answered = isinstance(item, Ask) and item.is_done
-        return Work(item, turn is not None, None if turn is None else turn.since, has_answered)
+        return Work(item, turn is not None, None if turn is None else turn.since, has_answered, newest=item)
 
     def rests(self, cell: Cell) -> list[TurnRest]:
         """What the turn in hand waits for that is no other actor's work; empty if that is not known in this process."""
@@ -123,6 +129,10 @@ class Home:
     def may_have_begun(self, cell: Cell, ask: Ask) -> bool:
         """Whether the turn of an ask may have begun whose deadline is over, and which was handed on with a number."""
         return True
+
+    def withdraw(self, cell: Cell, ask: Ask, then: Callable[[bool], None]) -> None:
+        """See to it that such an ask, which has not begun, never does; `then` hears, soon, whether that is sure."""
+        then(True)  # Its deadline goes with it, and nothing of it outlives this process.
 
     def holds_back(self, cell: Cell) -> str:
         """Why replies of turns that have ended do not leave now; "" if nothing keeps them."""
@@ -182,6 +192,9 @@ class Place:
         """End the life at once."""
         raise NotImplementedError
 
+    def require_order(self, cell: Cell, order: Order) -> None:
+        """Raises NotGranted: `stop` or `kill` would, for an actor may not give such an order there."""
+
     def control(self, cell: Cell, call: QueuedOrder) -> None:
         """Have an order carried out between two turns of the actor, ahead of all messages."""
         raise NotImplementedError
@@ -212,6 +225,10 @@ class Place:
     def running(self, cell: Cell) -> int:
         """The number of the input in hand, -1 if none is known."""
         return -1
+
+    def may_have_begun(self, cell: Cell, key: int) -> bool:
+        """Whether the present life may have begun a recorded input that has no end."""
+        return True
 
     def process(self, cell: Cell) -> Any:
         """The process besides this one that the present life is lived in, if there is one now."""
@@ -340,13 +357,28 @@ class AddressHost:
     def may_have_begun(self, cell: Cell, ask: Ask) -> bool:
         return self.home.may_have_begun(cell, ask)
 
+    def withdraw(self, cell: Cell, ask: Ask, then: Callable[[bool], None]) -> None:
+        self.home.withdraw(cell, ask, then)
+
     def holds_back(self, cell: Cell) -> str:
         return self.home.holds_back(cell)
 
     # -- the place's ------------------------------------------------------------------------------------------------
 
     def start(self, cell: Cell) -> asyncio.Future[None] | None:
-        return self.place.start(cell)
+        try:
+            up = self.place.start(cell)
+        except StartFailed as error:
+            self.home.start_failed(error)
+            raise
+        if up is not None:
+            up.add_done_callback(self._started)
+        return up
+
+    def _started(self, up: asyncio.Future[None]) -> None:
+        error = None if up.cancelled() else up.exception()
+        if isinstance(error, StartFailed):
+            self.home.start_failed(error)
 
     def stop(self, cell: Cell, reason: ExitReason) -> None:
         self.place.stop(cell, reason)

@@ -28,7 +28,7 @@ from .ref import current
 
 if TYPE_CHECKING:
     from .actor import Actor
-    from .cell import Cell
+    from .cell import Cell, Order
     from .context import ActorContext
     from .envelope import Handler
     from .message import Message
@@ -172,6 +172,10 @@ class ThreadContext:
     def _tell(self, cell: Cell, message: Message[Any]) -> None:
         """Send a tell from the worker thread, through the event loop."""
         self._on_loop(self._ctx._tell, cell, message)
+
+    def _order(self, cell: Cell, order: Order) -> None:
+        """Give an order from the worker thread, through the event loop."""
+        self._on_loop(self._ctx._order, cell, order)
 
     def _send(self, cell: Cell, message: Message[Any]) -> Any:
         """A ref's send: nothing here can be awaited."""

@@ -8,7 +8,7 @@ import dataclasses
 import time
 from collections import deque
 from collections.abc import Awaitable, Callable
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, TypeAlias, cast, get_args
 
 from ..errors import ActorStopped, UnknownMessage, type_name
 from ..exit_reasons import KILLED, SHUTDOWN, ExitReason
@@ -112,6 +112,10 @@ class Host(Protocol):
         """Whether the turn of an ask may have begun whose deadline is over, and which was handed on with a number."""
         ...
 
+    def withdraw(self, cell: Cell, ask: Ask, then: Callable[[bool], None]) -> None:
+        """See to it that such an ask, which has not begun, never does; `then` hears, soon, whether that is sure."""
+        ...
+
     def holds_back(self, cell: Cell) -> str:
         """Why replies of turns that have ended do not leave now; "" if nothing keeps them."""
         ...
@@ -148,6 +152,10 @@ class Host(Protocol):
         """A link or monitor at this cell was made or removed: its actor's own process has to know."""
         ...
 
+
+Order: TypeAlias = Literal["stop", "kill"]
+"""What an actor can do to the life of another one, by way of a ref."""
+ORDERS = frozenset(get_args(Order))
 
 Scope: TypeAlias = Literal["system", "fleet"]
 """Who finds an actor by a name: the system that it is of, or other systems and clients that are connected, too."""
@@ -508,6 +516,17 @@ class Cell(_Hot):
         if by is not None:
             self.host.home.faulted(self, by)
         self.host.kill(self)
+
+    def obey(self, order: Order, by: str) -> None:
+        """Stop or kill whoever lives at the address now. `by`: the actor that has ordered it; "" if that was none."""
+        if order == "stop":
+            self.living.request_stop()
+        else:
+            self.living.kill(by=by)
+
+    def require_order(self, order: Order) -> None:
+        """Raises NotGranted: from this process nobody may give such an order to whoever lives here."""
+        self.host.place.require_order(self, order)
 
     def ended(self) -> asyncio.Future[ExitReason]:
         """A future of the reason with which the present life ends; done already when there is none."""

@@ -19,6 +19,7 @@ from ..errors import ActorStopped, AskDeadlock, HoldfastError, SpecError, remote
 from ..exit_reasons import NORMAL, ExitReason
 from ..seconds import check_seconds
 from . import links, mailbox
+from .bindings import note_order
 from .blocking_handlers import is_async
 from .cell import TurnRest
 from .envelope import (
@@ -41,7 +42,7 @@ from .topics import NOT_TAKEN, publish
 
 if TYPE_CHECKING:
     from .actor import Actor, Start
-    from .cell import Cell
+    from .cell import Cell, Order
     from .loop import Suspended
     from .ref import ActorRef
 
@@ -197,6 +198,12 @@ class ActorContext:
         if cell.more is not None and cell.more.turn is not None and may_wait_for(cell, self._cell):
             node.loop.call_soon(end_circle, ask)
         return in_next_pass(future) if future.done() else future
+
+    def _order(self, cell: Cell, order: Order) -> None:
+        """A stop or kill by way of a ref."""
+        cell.node.check_thread(cell.path)
+        note_order(self._cell, cell)
+        cell.obey(order, self.path)
 
     def _chain(self) -> Chain:
         """This turn, and those that wait for it; nothing in a background task whose turn is over."""

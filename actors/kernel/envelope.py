@@ -265,6 +265,13 @@ class Ask(Item, msgspec.Struct, eq=False):
         started = self.started
         is_sure = not started or (started is not True and not self.to.host.may_have_begun(self.to, self))
         self.deadline = 0.0
+        if started and is_sure:
+            self.to.host.withdraw(self.to, self, self._end_late)
+        else:
+            self._end_late(is_sure)
+
+    def _end_late(self, is_sure: bool) -> None:
+        """Fail as an ask whose time is over; `is_sure`: its turn has not begun, and never will."""
         why = "" if is_sure else self.to.host.holds_back(self.to)
         self.fail(AskTimeout(self.to.path, self.timeout, False if is_sure else None, why))
 

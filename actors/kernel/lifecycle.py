@@ -10,6 +10,7 @@ import asyncio
 import contextvars
 import signal
 import weakref
+from asyncio.tasks import _unregister_task  # the documented hook for tasks that nobody waits for
 from collections import deque
 from collections.abc import Callable, Coroutine, Iterable
 from typing import TYPE_CHECKING, Any
@@ -513,6 +514,7 @@ def abandon(turn: Suspended) -> None:
     more.turn = None
     more.bindings.update(turn.rebinds or {})
     cell.node.turns_held -= 1
+    let_go(turn.runner.task)
     cell.node.emit(LifeAbandoned(cell.path, cell.life))
     reason: ExitReason = KILLED
     if turn.overran is None:
@@ -524,6 +526,12 @@ def abandon(turn: Suspended) -> None:
         tell_crash(cell, reason, turn.item)
     _kill_orphans(cell)
     ended(cell, reason)
+
+
+def let_go(task: asyncio.Task[Any]) -> None:
+    """Have nobody wait for a task that swallows its cancellation, as `asyncio.run` does for all that it knows of."""
+    _unregister_task(task)
+    task._log_destroy_pending = False  # type: ignore[attr-defined]
 
 
 def _kill_orphans(cell: Cell) -> None:

@@ -8,7 +8,7 @@ one life (`monitor`; between two lives of the next), or of the address (`watch`:
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from ..events import EndedByLink
 from ..exit_reasons import NOPROC, NORMAL, ExitReason
@@ -16,6 +16,10 @@ from .envelope import LEAVE, Item
 
 if TYPE_CHECKING:
     from .cell import Cell
+
+
+MADE_UP_NAME: Final = "$"
+"""How the names begin of actors that were given none."""
 
 
 class Monitor:
@@ -59,13 +63,21 @@ class LifeMonitor(Monitor):
 class Ties:
     """What binds the actors of an address to others: links, who watches them, and whom they watch or have ordered."""
 
-    __slots__ = ("links", "monitors", "ordered", "watching")
+    __slots__ = ("is_anew", "links", "monitors", "ordered", "watching")
 
     def __init__(self) -> None:
         self.links: dict[Cell, str] = {}  # and the address that each is known by here, also if it has moved
         self.monitors: list[LifeMonitor] = []
         self.watching: dict[LifeMonitor, None] = {}
         self.ordered: dict[str, None] = {}  # addresses to which it has given orders
+        self.is_anew = False  # its id was made up in this program, as the process says that it lives in
+
+
+def is_anew(cell: Cell) -> bool:
+    """Whether the id of an actor was made up, so that in an earlier program it may have been somebody else's."""
+    spec, more = cell.spec, cell.more
+    made_up = spec.made_up if spec is not None else cell.name.startswith(MADE_UP_NAME)
+    return made_up or (more is not None and more.has_more and more.ties.is_anew)
 
 
 def monitor(watcher: Cell, target: Cell, *, for_good: bool, name: str = "") -> LifeMonitor:

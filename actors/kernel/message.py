@@ -34,10 +34,11 @@ class Message(msgspec.Struct, Generic[R], frozen=True, array_like=True):
     """
 
 
-class RuntimeOrder(Message[R], Generic[R]):
+class RuntimeOrder(Message[R], Generic[R], repr_omit_defaults=True):
     """Base of messages that are orders of the runtime: they start or end lives, or change what runs.
 
-    From another process only whoever was granted the receiver's address may send them there.
+    From another process only whoever was granted the receiver's address may send them there. Their text has what was
+    given: some fields only the runtime gives.
     """
 
 

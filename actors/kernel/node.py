@@ -12,7 +12,7 @@ import weakref
 from collections import Counter
 from collections.abc import Awaitable, Callable
 from time import monotonic
-from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeVar, runtime_checkable
 
 from ..errors import (
     ActorStopped,
@@ -36,6 +36,7 @@ from .codec import Codec
 from .deadlines import Deadlines
 from .envelope import Item
 from .lifecycle import LOCAL
+from .links import MADE_UP_NAME
 from .loop import RunLoop
 from .mailbox import Bound, Bounded, admit_bounded, admit_gone
 from .message import Refusal
@@ -116,14 +117,27 @@ def _since_boot() -> float:
     return time.clock_gettime(time.CLOCK_BOOTTIME) if sys.platform == "linux" else monotonic()
 
 
+@runtime_checkable
+class TellsUnixTime(Protocol):
+    """An event loop with a clock of its own, from which all nodes on it have their Unix time."""
+
+    def unix_time(self) -> float:
+        """Seconds since 1970, which pass with the loop's."""
+        ...
+
+
 class Clock:
     """The times that a node goes by."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
-        self.is_monotonic = abs(monotonic() - loop.time()) < SAME_CLOCK  # whether the loop has the machine's clock
-        begin = time.time() - loop.time()  # On a virtual clock Unix time passes with the loop's, too.
-        self.wall: Callable[[], float] = time.time if self.is_monotonic else lambda: begin + loop.time()
+        begin, has_own = time.time() - loop.time(), isinstance(loop, TellsUnixTime)
+        self.is_monotonic = not has_own and abs(monotonic() - loop.time()) < SAME_CLOCK  # the loop has the machine's
+        self.wall: Callable[[], float] = lambda: begin + loop.time()
+        if isinstance(loop, TellsUnixTime):
+            self.wall = loop.unix_time
+        elif self.is_monotonic:
+            self.wall = time.time
         self.passed: Callable[[], float] = _since_boot if self.is_monotonic else loop.time
         """Seconds that have passed since some moment: nobody sets this clock."""
 
@@ -161,7 +175,7 @@ class Numbers:
 
     def next_name(self) -> str:
         """A name for an actor that was given none."""
-        return f"${next(self._names)}"
+        return f"{MADE_UP_NAME}{next(self._names)}"
 
     def next_turn(self) -> int:
         """A number for a turn that asks."""

@@ -10,13 +10,12 @@ from typing_extensions import TypeVar
 
 from ..errors import ActorRestarting, HoldfastError, SpecError
 from ..values.saved_refs import Addressed, hash_of_address
-from .bindings import note_order
 from .envelope import NO_DEADLINE, Ask, in_next_pass
 from .message import Message
 
 if TYPE_CHECKING:
     from .actor import Actor
-    from .cell import Cell
+    from .cell import Cell, Order
     from .context import ActorContext
 
 A_co = TypeVar("A_co", bound="Actor", default=Any, covariant=True)
@@ -139,23 +138,33 @@ class ActorRef(Addressed, Generic[A_co]):
         return in_next_pass(future) if future.done() else future
 
     def stop(self) -> None:
-        """Ask the actor to stop after what it has begun; a second stop is no error."""
-        self._cell.node.check_thread(self.path)
-        caller = current.get(None)
-        if caller is not None:
-            note_order(caller._cell, self._cell)
-        self._cell.living.request_stop()
+        """Ask the actor to stop after what it has begun; a second stop is no error.
+
+        In a turn of a recorded actor this is an output, which takes effect once, when the turn's outputs leave.
+
+        Raises:
+            NotGranted: the actor whose turn this is may not order that one from its process.
+        """
+        self._order("stop")
 
     def kill(self) -> None:
         """End this life at once, without its hooks. A supervisor treats it as a crash.
 
         If the actor is recorded, the message in its turn counts it against `max_deliveries`, as any death.
+        In a turn of a recorded actor this is an output, as is `stop`.
+
+        Raises:
+            NotGranted: as `stop`.
         """
-        self._cell.node.check_thread(self.path)
-        caller = current.get(None)
+        self._order("kill")
+
+    def _order(self, order: Order) -> None:
+        cell, caller = self._cell, current.get(None)
         if caller is not None:
-            note_order(caller._cell, self._cell)
-        self._cell.living.kill(by="" if caller is None else caller.path)
+            caller._order(cell, order)
+            return
+        cell.node.check_thread(cell.path)
+        cell.obey(order, "")
 
     def __repr__(self) -> str:
         return f"<ActorRef {self.path}>"

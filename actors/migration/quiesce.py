@@ -225,6 +225,9 @@ class Transit:
     def may_have_begun(self, cell: Cell, ask: Ask) -> bool:
         return True
 
+    def withdraw(self, cell: Cell, ask: Ask, then: Callable[[bool], None]) -> None:
+        then(False)
+
     def control(self, cell: Cell, call: QueuedOrder) -> None:
         self.waiting.append(lambda host: host.control(cell, call))
 

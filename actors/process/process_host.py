@@ -295,6 +295,10 @@ class WorkerHome(Home):
         """The number of the input that a process has in hand, -1 if none is known."""
         return -1
 
+    def has_come_to(self, worker: Worker, key: int) -> bool:
+        """Whether a process may have begun a recorded input that has no end."""
+        return True
+
     def lost(self, cell: Cell, worker: Worker | None, reason: ExitReason) -> Callable[[bool | None], None] | None:
         """The process is gone, or the life in it has ended. Returns what is done when it is known what follows.
 
@@ -404,8 +408,8 @@ class FlightHome(WorkerHome):
         newest = outlet.trim()
         has_answered = isinstance(newest, Ask) and newest.is_done
         if outlet.flight:
-            return Work(outlet.flight[0][1], True, None, has_answered, outlet.own_turns.seen)
-        return Work(outlet.sent, False, None, has_answered, outlet.own_turns.seen)
+            return Work(outlet.flight[0][1], True, None, has_answered, outlet.own_turns.seen, newest)
+        return Work(outlet.sent, False, None, has_answered, outlet.own_turns.seen, newest)
 
     def rests(self, cell: Cell) -> list[TurnRest]:
         outlet: Outlet | None = cell.extra().outlet
@@ -578,6 +582,10 @@ class WorkerPlace(Place):
         worker = self.workers.of(cell)
         return -1 if worker is None else self.home.in_hand(worker)
 
+    def may_have_begun(self, cell: Cell, key: int) -> bool:
+        worker = self.workers.of(cell)
+        return worker is not None and self.home.has_come_to(worker, key)
+
     def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
         worker = self.workers.of(cell)
         if worker is not None and verb in ("bind", "link", "unlink"):  # What its process has to know of itself.
@@ -640,6 +648,8 @@ def _command(node: Node, worker: Worker, frame: frames.Command) -> None:
             data = frame.data
             bound, last = data.get("bindings", {}), unpack_exit(data["last"]) if "last" in data else KILLED
             worker.inner.born(cell, data["path"], data["kind"], data["life"], bound, last)
+            if data.get("anew"):
+                node.cell_at(data["path"]).extra().ties.is_anew = True
         case "gone":
             reason, with_parent = unpack_exit(frame.data.get("reason")), bool(frame.data.get("with_parent"))
             worker.inner.gone(frame.data["path"], reason, with_parent=with_parent)
@@ -685,6 +695,8 @@ def keep(worker: Worker, frame: frames.Command) -> None:
                 keeper.returned(path)
             case "dismissed":
                 keeper.dismissed(path, below=bool(data.get("below")), for_good=bool(data.get("for_good")))
+            case "began":
+                keeper.began(path, [str(name) for name in data.get("listed", ())])
             case "note":
                 above, _, name = path.rpartition("/")
                 keeper.note(child_key(above, name), data.get("value"))

@@ -16,14 +16,14 @@ import msgspec
 from .. import exit_reasons
 from ..control.orders_lane import obey_order
 from ..deadline_thread import Overdue
-from ..errors import HoldfastError, NotGranted, StartFailed, StartIgnored
+from ..errors import ONLY_MESSAGES, HoldfastError, NotGranted, StartFailed, StartIgnored
 from ..events import ActorStarted, Event, event_data
 from ..exit_reasons import ExitReason, pack_exit
 from ..fast_loop import new_event_loop
 from ..kernel import lifecycle, links
 from ..kernel.actor import Start
 from ..kernel.address_host import AddressHost
-from ..kernel.cell import RUNNING, Cell, GivenName
+from ..kernel.cell import ORDERS, RUNNING, Cell, GivenName
 from ..kernel.envelope import AnyTable, Envelope
 from ..kernel.lifecycle import HERE, MAILBOX
 from ..kernel.message import Message, RuntimeOrder, message_name
@@ -245,9 +245,12 @@ class Guest(Peer):
         root = self.node.root
         if root is None or is_at_or_below(path, root.path):
             return
+        sender = current.get(None)
+        by = root.path if sender is None else sender.path
+        if order in ORDERS and not is_at_or_below(path, "/" + root.path.split("/")[1]):
+            raise NotGranted(path, order, by, ONLY_MESSAGES)
         if not is_granted(path, root, every_cell(root)):
-            sender = current.get(None)
-            raise NotGranted(path, order, root.path if sender is None else sender.path)
+            raise NotGranted(path, order, by)
 
     def publish(self, topic: str, item: Envelope) -> asyncio.Future[None]:
         """Publish through the root; the future ends when every subscriber has accepted."""
@@ -312,6 +315,8 @@ class Guest(Peer):
             bound = {port: target.path for port, target in cell.extra().bindings.items()}
             last = pack_exit(cell.extra().reason)  # how the life before it ended, if there was one
             born = {"path": path, "kind": message_name(kind), "life": cell.life, "bindings": bound, "last": last}
+            if links.is_anew(cell):
+                born["anew"] = True
             self.command(root, "born", born)
 
     def _on_event(self, event: Event) -> None:

@@ -9,7 +9,7 @@ waits for.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -33,6 +33,8 @@ MOST_INPUTS = 128
 """Messages that stand in one row."""
 MOST_BYTES = 16 << 10
 """Bytes in a row from which on no more messages are added to it."""
+PATIENCE = 1.0
+"""Seconds that an ask whose time is over waits for the store; then nobody can say whether the next program knows."""
 
 
 class InputRow:
@@ -235,7 +237,7 @@ class TurnRows:
             return False
         commits.check()
         source = home.ledger.admit(MESSAGE, name, body, home.node.clock.wall(), sender)
-        source.ask, source.chain = ask, ask.chain
+        home.awaits(source, ask)
         home.forward(source)  # In front of the submission: the loop comes to its turn before it comes to the store.
         row = self._row
         if row is None or not row.takes(source):
@@ -325,3 +327,58 @@ def taken_up(home: Switch, item: Item) -> tuple[str, str, bytes] | None:
     if not item.recovering:
         home.ties.over(verb, target)
     return DOWN, "", msgspec.msgpack.encode(data)
+
+
+class Withdrawal:
+    """An input that is not begun any more, as the next program reads it; `then` hears once whether it will."""
+
+    weight = 1
+    __slots__ = ("_home", "_positions", "_source", "_then", "_timer")
+
+    def __init__(self, home: Switch, source: Input, then: Callable[[bool], None]) -> None:
+        self._home, self._source = home, source
+        self._then: Callable[[bool], None] | None = then
+        if source.positions is None:
+            source.positions = []
+        self._positions = source.positions
+        self._timer: asyncio.TimerHandle = home.node.loop.call_later(PATIENCE, self._tell, False)
+
+    @property
+    def entries(self) -> Sequence[tuple[str, Entry]]:
+        """What the next program reads."""
+        return ((self._home.path, ("late", self._source.id)),)
+
+    def written(self, positions: Sequence[int]) -> None:
+        """It stands there in the journal."""
+        self._positions += positions
+
+    def safe(self) -> None:
+        """It lasts."""
+        self._tell(True)
+
+    def refused(self, error: HoldfastError) -> bool:
+        """It has happened: it waits."""
+        return False
+
+    def abandoned(self, error: HoldfastError) -> None:
+        """The next program will not know."""
+        self._tell(False)
+
+    def _tell(self, lasts: bool) -> None:
+        self._timer.cancel()
+        then, self._then = self._then, None
+        if then is not None:
+            then(lasts)
+
+
+def withdraw(home: Switch, source: Input, then: Callable[[bool], None]) -> None:
+    """Have an input never begun that no life has begun; `then` hears, within a second, whether that will last."""
+    commits = home.journal.commits
+    source.is_late = True
+    if not home.journal.durable:
+        then(True)  # Nothing of it outlives this process.
+    elif commits.blocked is not None or commits.stopped is not None:
+        then(False)
+    else:
+        home.outputs.rows.close()
+        home.journal.submit(Withdrawal(home, source, then))

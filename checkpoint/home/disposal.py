@@ -246,7 +246,7 @@ class Erasures:
         return Erased(
             top,
             sum(homes.knows(path) for path in homes.tree_of(top)),
-            sum(1 for _ in homes.child_notes(top)),
+            sum(map(_is_child, homes.child_notes(top))),
             homes.quarantine.forget_below(top, dry_run=True),
             self.history(top, True) if self.history is not None else 0,
             sum(forget(top, True) for forget in self.notes),
@@ -298,7 +298,7 @@ class Erasures:
             noted = list(islice(homes.child_notes(one.top), AT_ONCE - len(known)))
             for path in noted:
                 homes.note(f"{CHILDREN}{path}", None)
-                one.children += 1
+                one.children += _is_child(path)
             if len(known) + len(noted) < AT_ONCE:
                 self._finish(one)
         except HoldfastError as error:
@@ -320,6 +320,11 @@ class Erasures:
             homes.journal.note(ERASING, None)
         del self._under_way[top]
         one.done.set_result(Erased(top, one.addresses, one.children, put_aside, events, others))
+
+
+def _is_child(noted: str) -> bool:
+    """Whether it is a child that is noted so, and not what its supervisor was given."""
+    return not noted.endswith("/")
 
 
 def _looked_at(done: asyncio.Future[Erased]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import TYPE_CHECKING
 
 from ...actors.errors import ControlFailed, HoldfastError, StartFailed
@@ -23,6 +23,7 @@ from ..snapshot.rollback import older_snapshot, roll_back
 from ..snapshot.snapshot_groups import Groups
 from ..snapshot.snapshot_record import take_over
 from ..snapshot.snapshot_schedule import nobody
+from .absent import Absent
 from .ask_recovery import FarMail, Rejoin
 from .capacity import HomeBound
 from .disposal import Erased, Erasures, drop_all, forget_home, put_into_quarantine
@@ -83,6 +84,7 @@ class Homes:
         self.rejoin = Rejoin(self, bears_repetition)
         self.far = FarMail(self)
         self.erasures = Erasures(self)
+        self.absent = Absent(self)
 
     def of(self, cell: Cell, method: Method) -> Switch:
         """The home of an address; taken up from the store when it is first asked for.
@@ -227,6 +229,7 @@ class Homes:
                     switch.readdress(path)
                 switch.ties.rename(lambda one: renamed(names, one))
             self.rejoin.rename(paths)
+            self.absent.rename(lambda one: renamed(names, one))
 
     def _move_stored(self, names: Mapping[str, str], paths: Mapping[str, str]) -> None:
         for path in {now for now in paths.values() if now not in paths and self.knows(now)}:
@@ -396,9 +399,14 @@ class Homes:
             tell(path)
         if not below:
             return
+        self.absent.dismissed(path)
         for waiting in self.known(path):
             if (switch := self._switches.get(waiting)) is not None:
                 end_wait(switch)
+
+    def began(self, path: str, listed: Collection[str]) -> None:
+        """The supervisor at `path` begins with these children: nobody else is brought back below it."""
+        self.absent.began(path, listed)
 
     def note(self, key: str, value: bytes | None) -> None:
         """Keep a small fact; None forgets it."""

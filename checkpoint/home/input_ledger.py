@@ -545,6 +545,7 @@ class InputLedger:
         """All of it behind the newest snapshot, as `read_entry` takes it."""
         inputs = {source.id: source for source in self.handled_and_open()}
         entries = [inputs[key].entry() for key in sorted(inputs)]
+        entries += [("late", key) for key, source in self.open.items() if source.is_late]
         heard = sorted(self.outcomes.items())
         entries += [outcome_entry(*place, answer) for place, answer in heard if place[0] <= self.turn]
         entries += [turn.entry(number) for number, turn in self.turns.items()]
@@ -608,6 +609,12 @@ class InputLedger:
                     self.open[key].deliveries = count
                     source = self.open[key]
                     source.positions = [*(source.positions or ()), position]
+            case ("late", key):
+                if key in self.open:
+                    source = self.open[key]
+                    source.is_late, source.positions = True, [*(source.positions or ()), position]
+                else:
+                    self.drop([position])
             case _:
                 return False
         return True

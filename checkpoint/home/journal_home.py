@@ -19,11 +19,12 @@ from ...actors.kernel import links
 from ...actors.kernel.address_host import Work
 from ...actors.kernel.cell import RUNNING, Cell, TurnRest
 from ...actors.kernel.lifecycle import MAILBOX
-from ...actors.persistence import UNFIT
+from ...actors.persistence import UNFIT, is_in_vain
 from ..method import Method
 from ..recovery.recoveries import Recovery
 from ..snapshot.unreplayed import forget_turns
-from ..turn_word import input_of
+from ..turn_word import input_of, may_have_begun
+from .admission import withdraw
 from .disposal import drop_all
 from .held_messages import (
     MAY_LIVE_AGAIN,
@@ -43,8 +44,9 @@ from .switch import Switch
 
 if TYPE_CHECKING:
     from ...actors.kernel.address_host import Capacity, Parent
-    from ...actors.kernel.envelope import Item
+    from ...actors.kernel.envelope import Ask, Item
     from ...actors.process.worker_pool import Worker
+    from ..inputs import Input
 
 
 class RecoveryClock:
@@ -112,6 +114,7 @@ class JournalHome(RecordedHome):
 
     def enter(self, cell: Cell) -> Entered:
         """As `open`, and it is a recovery if anything comes back, or if one is not over."""
+        self.in_vain = ""
         entered = self.open(cell)
         entered.switch.life.follow()
         recoveries = self.homes.recoveries
@@ -268,6 +271,28 @@ class JournalHome(RecordedHome):
     def rests(self, cell: Cell) -> list[TurnRest]:
         return [] if self.switch is None else self.switch.calls.resting()
 
+    def may_have_begun(self, cell: Cell, ask: Ask) -> bool:
+        """Of an input that has no end: the present life may have it in hand, or an earlier one may have had it."""
+        source, switch = self._asked(ask), self.switch
+        if source is None or switch is None or not cell.node.clock.is_past(ask.deadline):
+            return True
+        life = switch.life
+        if source.was_cut or source.was_stashed or source.id == switch.ledger.begun or not life.counts:
+            return True
+        return life.port is not None and cell.host.place.may_have_begun(cell, source.id)
+
+    def withdraw(self, cell: Cell, ask: Ask, then: Callable[[bool], None]) -> None:
+        source = self._asked(ask)
+        if source is None or self.switch is None:
+            then(False)
+        else:
+            withdraw(self.switch, source, then)
+
+    def _asked(self, ask: Ask) -> Input | None:
+        """The input that an ask has become, if it has no end."""
+        source = None if self.switch is None else self.switch.open.get(ask.started - 1)
+        return source if source is not None and source.ask is ask else None
+
     def holds_back(self, cell: Cell) -> str:
         """A turn that has ended waits for a store without room: what it has done is kept, and its reply comes then."""
         blocked = self.homes.journal.blocked
@@ -333,6 +358,9 @@ class JournalHome(RecordedHome):
 
     def in_hand(self, worker: Worker) -> int:
         return input_of(worker.page[0])
+
+    def has_come_to(self, worker: Worker, key: int) -> bool:
+        return may_have_begun(worker.page[0], key)
 
     def lost(self, cell: Cell, worker: Worker | None, reason: ExitReason) -> Callable[[bool | None], None] | None:
         """Keep everything, and count deaths in the same turn."""
@@ -443,6 +471,9 @@ class JournalHome(RecordedHome):
             if node.events.has_listeners:
                 node.emit(Recovered(cell.path, cell.life, switch.life.replayed, clock.phases(restore_seconds)))
         self.homes.recoveries.over(cell.path)
+
+    def start_failed(self, error: StartFailed) -> None:
+        self.in_vain = error.reason if is_in_vain(error.reason) else ""
 
     async def _let_at(self, switch: Switch, clock: RecoveryClock, restore_seconds: float) -> None:
         """S4, if anybody has a say in it; else the home has done it.

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
+from ...actors.kernel.cell import ORDERS
 from ...actors.process.wire import frames
 from ...actors.process.wire.frames import BadFrame
-from ..protocol import Released, Snapshot, ToHome, ToLife, TurnEnd, Wanted
+from ..protocol import Hooked, Released, Snapshot, ToHome, ToLife, TurnEnd, Wanted
 
 if TYPE_CHECKING:
     from ...actors.process.worker_pool import Worker
@@ -36,10 +37,12 @@ def records_of(worker: Worker, take: Callable[[ToHome], None]) -> frames.TakeRec
 
     def taken(frame: frames.Record) -> None:
         record = decode(frame.body)
-        if isinstance(record, (TurnEnd, Released)):
-            for out in record.outs:
+        if isinstance(record, (TurnEnd, Released, Hooked)):
+            for out in [record.out] if isinstance(record, Hooked) else record.outs:
                 if out.verb in SENT:
                     gate.output(out.to, out.name)
+                elif out.verb in ORDERS:
+                    gate.order(out.to, out.verb)
         elif isinstance(record, Wanted):
             gate.claims(record.bindings)
             if record.register is not None:

@@ -97,6 +97,8 @@ class Outputs:
                 home.ties.turn(turn, out.verb, out.to)
                 home.note(turn, ("tie", turn, out.verb, out.to), batch)
                 batch.after.append(lambda: connect(cell, node.cell_at(out.to), out.verb))
+            case "kill" | "stop" as order:
+                batch.after.append(lambda: node.cell_at(out.to).obey(order, home.path))
             case "pipe":
                 pass
             case verb:
@@ -340,7 +342,7 @@ class Outputs:
         """An ask to a recorded actor, up or not, is journaled in the same append."""
         origin = origin_of(ask) if isinstance(ask, SwitchAsk) else ""
         asked = switch.record(MESSAGE, out.name, out.body, sender, batch, origin)
-        asked.ask, asked.chain = ask, ask.chain
+        switch.awaits(asked, ask)
         batch.after.append(lambda: switch.admitted(asked))
 
     def _send_ask(self, key: int, target: Cell, ask: SwitchAsk) -> None:
@@ -374,7 +376,7 @@ class Outputs:
         if source is None or ask is None:
             self._deliver(target, turn, out, batch, None if source is None else source.sender)
             return
-        source.ask = None  # From now on it is the receiver's to answer.
+        source.ask, ask.started = None, True  # From now on it is the receiver's to answer.
         if out.trace:
             ask.chain = with_tail(ask.chain, out.trace)
             follow(ask)

@@ -93,6 +93,11 @@ class PresentLife:
         return self.is_released or (self.port is not None and self.live is not None and self.live.done())
 
     @property
+    def counts(self) -> bool:
+        """Whether what it says is heard."""
+        return self.diverged is None and not self.is_void
+
+    @property
     def may_be_released(self) -> bool:
         """Whether nobody else has a say in it, and those that it may send to are there."""
         return not self.waits_for_release and not self.is_kept_back

@@ -16,6 +16,8 @@ class RecordedHome(WorkerHome):
 
     switch: Switch | None
     """There is none before the first life begins, or is waited for with a message."""
+    in_vain: str = ""
+    """Why the last start has failed, and each further one will, unless with other code; "" if that is not so."""
 
     def take_in(self, cell: Cell) -> None:
         """Record what is sent to an address ahead of its first life in this program, and hold it for that.
@@ -36,6 +38,19 @@ def said_of_turn(cell: Cell) -> str:
     switch = switch_of(cell)
     said = "" if switch is None else switch.calls.said()
     return f"a turn of {cell.path} {said}" if said else ""
+
+
+def why_in_vain(cell: Cell) -> str:
+    """Why a recorded actor cannot be brought back by the code that it has, in words; "" if that is not known."""
+    home = cell.host.home
+    return home.in_vain if isinstance(home, RecordedHome) else ""
+
+
+def give_other_code(cell: Cell) -> None:
+    """The next start has other code: why the last one has failed says nothing of it."""
+    home = cell.host.home
+    if isinstance(home, RecordedHome):
+        home.in_vain = ""
 
 
 def switch_of(cell: Cell) -> Switch | None:

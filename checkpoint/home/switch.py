@@ -194,8 +194,14 @@ class Switch:
         except HoldfastError as error:  # The store has no room, or has failed.
             ask.fail(error)
             return
-        source.ask, source.chain = ask, ask.chain
+        self.awaits(source, ask)
         self.forward(source)
+
+    def awaits(self, source: Input, ask: Ask) -> None:
+        """Have an input answer an ask, which knows it by its number if nobody has begun it elsewhere."""
+        source.ask, source.chain = ask, ask.chain
+        if ask.started is False:
+            ask.started = source.id + 1
 
     def waits(self, ask: Ask) -> bool:
         """Whether a turn of ours waits for this ask."""
@@ -284,8 +290,6 @@ class Switch:
             return
         port = life.port
         if life.is_released and port is not None and (bound is None or bound.may_feed(source)):
-            if source.ask is not None and port.begins:
-                source.ask.started = True
             port.take(source)
         if rests.wanted or self.calls.long:
             rests.show((source,))
@@ -296,7 +300,8 @@ class Switch:
         if kind is None or source.kind != MESSAGE or source.held or source.id == self.ledger.begun:
             return False
         handles = declared(kind, source.name)
-        return handles is not None and handles.readonly and source.id not in self.ledger.stashed()
+        is_free = not source.is_late and source.id not in self.ledger.stashed()
+        return handles is not None and handles.readonly and is_free
 
     def push(self, item: Item) -> None:
         """An EXIT or DOWN is an input too."""
@@ -391,8 +396,6 @@ class Switch:
         begun = ledger.begun
         for index, source in enumerate(ledger.waiting()):
             if bound is None or bound.may_feed(source):
-                if source.ask is not None and port.begins:
-                    source.ask.started = True
                 if source.id == begun and port.begins:
                     self.life.owed = len(ledger.released)
                 port.to_life(source.feed(-1, pipes if index == 0 else (), has_begun=source.id == begun))
@@ -412,6 +415,7 @@ class Switch:
 
         `running` is the input in hand, -1 if none; `ordered`: it was not its doing; `has_hung`: that turn did not end.
         """
+        self._doubt()
         ends = self.ledger.own_end.wanted
         self.life.has_ended = ends is not None and self.life.is_live and is_end_of(ends.exit_reason, reason)
         self.life.die()
@@ -423,6 +427,15 @@ class Switch:
         poison = self.ledger.count_death(running, is_ordered=ordered, most=most)
         if poison is not None:
             put_into_quarantine(self, poison)
+
+    def _doubt(self) -> None:
+        """The life is over: what it was given may have begun, if it is not known what it has said last."""
+        port, begun = self.life.port, self.ledger.open.get(self.ledger.begun)
+        is_unknown = port is not None and port.begins and (port.is_far or not self.life.counts)
+        given = self.ledger.open.values() if is_unknown and self.life.is_released else ()
+        for source in (*given, *(() if begun is None else (begun,))):
+            if source.ask is not None and not source.is_late:
+                source.ask.started = True
 
     def rests_in(self, running: int) -> bool:
         """Whether the turn of this input waits until a moment or for a message: for days, if that is wanted."""

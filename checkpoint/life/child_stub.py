@@ -186,8 +186,8 @@ class ChildPlace(Place):
         port = self.join(cell)
         kind, topics = message_name(start.kind), list(start.kind._topics)
         bindings = {name: target.path for name, target in cell.extra().bindings.items()}
-        register = cell.spec.register
-        port.to_home(Wanted(self._number, kind, topics, method, self.home.bound, made, bindings, register))
+        spec, bound = cell.spec, self.home.bound
+        port.to_home(Wanted(self._number, kind, topics, method, bound, made, bindings, spec.register, spec.made_up))
         return self._up
 
     def is_starting(self, number: int) -> bool:

@@ -78,17 +78,17 @@ def answer_beside(life: Life, feed: Feed) -> None:
     context, ctx = context.copy(), actor.ctx
     context.run(current.set, standing)
     actor.ctx = standing
-    begun = 0 if life.page is None else life.page[0]
-    if life.page is not None:
-        life.page[0] = feed.id + 1  # If the process dies of it.
+    how = 0 if life.word is None else life.word.how
+    if life.word is not None:
+        life.word.look(feed.id)  # If the process dies of it.
     try:
         answer = cell.node.step_beside(context, lambda: _answered(life, feed))
     except BaseException:  # Whatever user code raises: it does so again in its turn, which is judged as any other.
         return
     finally:
         actor.ctx = ctx
-        if life.page is not None:
-            life.page[0] = begun
+        if life.word is not None:
+            life.word.mark(how)
     life.drop_queued(feed.id)
     life.port.to_home(Glanced(feed.id, answer))
 

@@ -22,9 +22,10 @@ from ...actors.errors import (
     remote_crash,
     type_name,
 )
-from ...actors.exit_reasons import NORMAL, ExitReason, pack_exit
+from ...actors.exit_reasons import NORMAL, SHUTDOWN, ExitReason, pack_exit
 from ...actors.kernel.actor import Actor
-from ...actors.kernel.cell import Cell
+from ...actors.kernel.bindings import note_order
+from ...actors.kernel.cell import Cell, Order
 from ...actors.kernel.context import NO_MESSAGE, ActorContext, StashError
 from ...actors.kernel.envelope import Ask, Item, ReplyHandle
 from ...actors.kernel.links import Monitor
@@ -348,6 +349,20 @@ class RecordedContext(ActorContext):
     def waits_for_room(self, topic: str) -> bool:
         """Whether to wait, in the middle of the turn, until all subscribers have accepted what is published."""
         return True
+
+    def _order(self, cell: Cell, order: Order) -> None:
+        own = cell.living.path == self.path
+        if own and order == "stop":
+            self.stop(SHUTDOWN)
+        elif not self._in_turn():
+            self._outside()
+            super()._order(cell, order)
+        else:
+            cell.node.check_thread(cell.path)
+            if not own:
+                cell.require_order(order)
+                note_order(self._cell, cell)
+            self.recorded.put(order, cell.path)
 
     async def flush(self) -> None:
         self.recorded.release()

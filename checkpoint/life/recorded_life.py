@@ -71,6 +71,7 @@ from ..protocol import (
 )
 from ..snapshot.image_writer import Imaging
 from ..snapshot.key_variables import check_keys, restore_state, save_state, variables
+from ..turn_word import OVER, TurnWord
 from .determinism_guard import DeterminismGuard
 from .glances import answer_beside
 from .life_state import Asked, Awaited, LifeStage, LifeTimers, LifeWaits, RestoredState, SnapshotState
@@ -113,7 +114,8 @@ class Life:
     def __init__(
         self, cell: Cell, port: HomePort, method: Method, page: memoryview | None, *, may_fork: bool = False
     ) -> None:
-        self.cell, self.port, self.method, self.page = cell, port, method, page
+        self.cell, self.port, self.method = cell, port, method
+        self.word = None if page is None else TurnWord(page)
         self.turn = 0
         self.feed: Feed | None = None
         self.outs: list[Out] = []
@@ -141,8 +143,8 @@ class Life:
         """
         cell = self.cell
         cell.life += 1
-        if self.page is not None:  # What stood there is the turn in which an earlier life was killed.
-            self.page[0] = 0
+        if self.word is not None:
+            self.word.clear()
         self.hook = INIT
         lifecycle.build(cell, start, self._context)
         self.hook = ""
@@ -339,8 +341,8 @@ class Life:
             waits.order.begin()
         if self.outs:  # What a turn that was left in the middle has said does not count.
             self.outs = []
-        if self.page is not None:
-            self.page[0] = feed.id + 1
+        if self.word is not None:
+            self.word.begin(feed.id)
 
     def note_timers(self, feed: Feed) -> None:
         """The message of a timer has come, in this turn or in those before it that are left out."""
@@ -349,11 +351,8 @@ class Life:
 
     def mark(self, how: int = 0) -> None:
         """Say on the page that the turn in hand is at work, or (WAITS) that it waits."""
-        feed = self.feed
-        if self.page is not None and feed is not None:  # Else it is over, or its life was abandoned.
-            self.page[0] = (
-                0 if how and self.waits.resting else feed.id + 1 | how
-            )  # What rests for days ends no process.
+        if self.word is not None and self.feed is not None:  # Else it is over, or its life was abandoned.
+            self.word.mark(OVER if how and self.waits.resting else how)  # What rests for days ends no process.
 
     def say_it_waits(self) -> None:
         """Say that the turn which had begun in an earlier life does not get on by itself, or does not begin."""
@@ -375,8 +374,8 @@ class Life:
         outs, self.feed, self.outs = self.outs, None, []
         ends = None if status == FAILED else self.stage.ending
         self.port.to_home(TurnEnd(self.turn, feed.id, status, outs, answer, state, ends))
-        if self.page is not None:
-            self.page[0] = 0
+        if self.word is not None:
+            self.word.mark(OVER)
         if self.is_live and self.stage.begun >= 0:
             self.stage.begun = -1
             if self.returned:
@@ -404,8 +403,8 @@ class Life:
         if reason is None or turn is None or turn.then is not None or turn.killed or self.feed is None:
             return
         if self.is_live and self.method.replays and (self.waits.resting or self.waits.are_stranded):
-            if self.page is not None:
-                self.page[0] = 0  # No end of this life is due to the turn.
+            if self.word is not None:
+                self.word.mark(OVER)  # No end of this life is due to the turn.
             self._leave(turn, reason)
 
     def _leave(self, turn: Suspended, reason: ExitReason) -> None:
@@ -425,8 +424,8 @@ class Life:
         """The actor does not want to be started: turn 0 stays open for the next start."""
         self.feed, self.outs, self.stage.ignored_why = None, [], why
         self.enter(STOP)  # That is what is left.
-        if self.page is not None:
-            self.page[0] = 0
+        if self.word is not None:
+            self.word.mark(OVER)
         self.port.to_home(Ignored(why))
 
     def has_result(self, k: int) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
@@ -175,6 +175,10 @@ class GuestKeeper:
     def dismissed(self, path: str, *, below: bool, for_good: bool) -> None:
         """A supervisor in this process has given up an address."""
         self._say("dismissed", path, below=below, for_good=for_good)
+
+    def began(self, path: str, listed: Collection[str]) -> None:
+        """A supervisor in this process begins with these children."""
+        self._say("began", path, listed=list(listed))
 
     def note(self, key: str, value: bytes | None) -> None:
         """Keep the fact that a supervisor has a child; None forgets it. Other facts are kept until the process ends."""

@@ -31,7 +31,7 @@ from ..home.journal_home import Entered, JournalHome
 from ..home.life_ports import RemoteLife
 from ..method import hybrid
 from ..protocol import AtRoot, Begin, Closed, Over, Respec, Started, ToHome, Wanted
-from ..turn_word import blamed, input_of
+from ..turn_word import blamed, input_of, may_have_begun
 
 STOPPED_STARTING = "it was stopped while it started"
 
@@ -482,6 +482,10 @@ class SlotPlace(Place):
     def running(self, cell: Cell) -> int:
         parent = self._parent
         return -1 if parent.worker is None or parent.wanted is None else input_of(parent.worker.page[parent.slot])
+
+    def may_have_begun(self, cell: Cell, key: int) -> bool:
+        parent = self._parent
+        return parent.worker is not None and may_have_begun(parent.worker.page[parent.slot], key)
 
     def retired(self, cell: Cell) -> None:
         live = None if self._home.switch is None else self._home.switch.life.live

@@ -105,6 +105,9 @@ class LifeHere(LifePlace):
         feed = self.life.feed if self.life is not None else None
         return -1 if feed is None else feed.id
 
+    def may_have_begun(self, cell: Cell, key: int) -> bool:
+        return key == self.running(cell)
+
     def retired(self, cell: Cell) -> None:
         if self._starting is not None and not self._starting.done():
             self._starting.cancel()

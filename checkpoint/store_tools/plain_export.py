@@ -44,6 +44,7 @@ _NAMES: Final[dict[str, tuple[str, ...]]] = {
     "kept": ("origin", "type", "value", "sender"),
     "drop": ("input",),
     "tried": ("input", "deliveries"),
+    "late": ("input",),
     "stop": ("turn", "reason", "is_cut_off"),
     "tie": ("turn", "verb", "other"),
     "later": ("turn", "input"),

@@ -19,6 +19,7 @@ import msgspec
 
 from ...actors.control.trace_tail import enveloped
 from ...actors.errors import (
+    ONLY_MESSAGES,
     BadMessage,
     BadReply,
     ConnectionFull,
@@ -30,9 +31,9 @@ from ...actors.errors import (
     type_name,
 )
 from ...actors.events import ConnectionLimited
-from ...actors.exit_reasons import ExitReason, NoConnection, pack_exit
+from ...actors.exit_reasons import NoConnection, pack_exit
 from ...actors.kernel import links
-from ...actors.kernel.cell import ANY, RUNNING, Cell
+from ...actors.kernel.cell import ANY, RUNNING, Cell, Order
 from ...actors.kernel.codec import Parcel, encode_special, unencodable
 from ...actors.kernel.envelope import AnyTable, Ask
 from ...actors.kernel.message import Message, RuntimeOrder, message_name
@@ -187,10 +188,7 @@ class FarHome(RemoteHome):
 
 
 def _not_granted(cell: Cell, order: str) -> NotGranted:
-    remedy = (
-        "only messages go over a connection; send one to an actor there that gives the order, or use the command line"
-    )
-    return NotGranted(cell.path, order, "another program", remedy)
+    return NotGranted(cell.path, order, "another program", ONLY_MESSAGES)
 
 
 class FarPlace(OutsidePlace):
@@ -198,11 +196,8 @@ class FarPlace(OutsidePlace):
 
     kind = "another system"
 
-    def stop(self, cell: Cell, reason: ExitReason) -> None:
-        raise _not_granted(cell, "stop")
-
-    def kill(self, cell: Cell) -> None:
-        raise _not_granted(cell, "kill")
+    def require_order(self, cell: Cell, order: Order) -> None:
+        raise _not_granted(cell, order)
 
     def control(self, cell: Cell, call: QueuedOrder) -> None:
         call.ask.fail(_not_granted(cell, "an order"))

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import msgspec
 
-from ...system.history.evidence import LONG_TURN, seconds_text
+from ...system.history.evidence import LONG_TURN, messages_text, seconds_text
 from ...system.history.why import MANY, MUCH, NO_TROUBLE
 from ..overview import ActorRow
 
@@ -215,7 +215,8 @@ def seen_causes(seen: SeenSystem, path: str) -> list[tuple[str, str]]:
         return []
     seconds = seen.now - row.turn_seconds
     if row.state == "suspended":
-        return [("suspended", f"{path} is suspended: it handles nothing, and {row.queued} messages wait.")]
+        waits = messages_text(row.queued) if row.queued else "what comes waits"
+        return [("suspended", f"{path} is suspended: it handles nothing, and {waits} for `resume`.")]
     if row.turn and not row.rests and seconds >= LONG_TURN:
         return [("its turn waits", f"{path} has been in the turn of {row.turn} for {seconds_text(seconds)}.")]
     if row.state == "stopped":

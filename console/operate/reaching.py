@@ -152,6 +152,12 @@ OnePath = Annotated[
 ]
 
 
+RootOrOne = Annotated[
+    str | None,
+    typer.Argument(metavar="PATH", help="An address or a name.", autocompletion=complete_path, callback=alone),
+]
+
+
 NOBODY = "no system of yours is found by its name"
 OF_ITS_OWN = (
     "a program opens an endpoint by control_endpoint(system), and with a path of its own it is reached by --socket FILE"

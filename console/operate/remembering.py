@@ -18,6 +18,7 @@ from .reaching import (
     UNUSABLE,
     Json,
     OnePath,
+    RootOrOne,
     Socket,
     System,
     ended,
@@ -36,9 +37,10 @@ KINDS = frozenset(events_of_all.__all__) | {"SystemStarted", "SystemStopped", "E
 Pattern = Annotated[str, typer.Argument(help="An address, or a pattern such as '/app/bank/**'.")]
 
 
-def why(path: OnePath, system: System = None, socket: Socket = None, as_json: Json = False) -> None:
-    """Say in a few sentences why an actor restarts, has ended, or does not get on."""
+def why(path: RootOrOne = None, system: System = None, socket: Socket = None, as_json: Json = False) -> None:
+    """Say in a few sentences why an actor restarts, has ended, or does not get on; left out, the root is meant."""
     with reached("why", system, socket) as remote:
+        path = path or f"/{remote.about()['name']}"
         sentences = asyncio.run(remote.why(path))
         if not remote.lives(path) and path not in remote.tree():
             raise ended("why", " ".join(sentences) + no_pattern(path), FAILED)

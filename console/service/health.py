@@ -7,7 +7,7 @@ import dataclasses
 import os
 import signal
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from http import HTTPStatus
 from types import TracebackType
 from typing import Final
@@ -64,6 +64,7 @@ class Service:
         workers: how many numbers there are, from 0 on: the worker gets the first whose store nobody has. The master
             process of the server talks to the service manager then, and the workers do not.
         patience: seconds that a worker waits for a number, while those before it are still stopping.
+        watch: addresses of supervisors whose children have to run, as those of the root, before it is ready.
         ends_server: if the tree fails, have the program end in good order, by SIGTERM to itself. For the lifespan of an
             ASGI application, whose server would go on listening without it.
         probes: `HOST:PORT` at which `GET /livez` and `GET /readyz` are answered, for a program without a web server;
@@ -80,6 +81,7 @@ class Service:
         *,
         workers: int = 1,
         patience: float = 30.0,
+        watch: Sequence[str] = (),
         ends_server: bool = False,
         probes: str | None = None,
         environment: Mapping[str, str] = os.environ,
@@ -93,6 +95,9 @@ class Service:
         self._made = system
         self._workers = workers
         self._patience = check_seconds("Service", "patience", patience)
+        if isinstance(watch, str):
+            raise SpecError("Service", f"watch takes addresses, not one text {watch!r:.100}: give [{watch!r:.100}]")
+        self._watch = tuple(watch)
         self._ends_server = ends_server
         self._system: ActorSystem | None = None
         self._probes = ProbeServer(probes, self._probed) if probes is not None else None
@@ -190,6 +195,8 @@ class Service:
     async def ready(self, timeout: float = PROBE_TIMEOUT) -> Health:
         """Say whether requests should come here: all is up, is not stopping, accepts, and no child of the root is away.
 
+        So it is with the children of those that `watch` names.
+
         Args:
             timeout: seconds that the root has to answer.
         """
@@ -217,12 +224,13 @@ class Service:
         """What will be well again by itself, or by an operator."""
         blocked = system.store_problem()
         problems = [blocked] if blocked else []
-        try:
-            counts = await system.ref(f"/{system.name}", Supervisor).ask(CountChildren(), timeout)
-        except HoldfastError as error:
-            return [*problems, f"the root does not answer: {error}"]
-        if counts.active < counts.specs:
-            problems.append(f"{counts.specs - counts.active} of {counts.specs} children of the root do not run")
+        for name, path in (("the root", f"/{system.name}"), *((path, path) for path in self._watch)):
+            try:
+                counts = await system.ref(path, Supervisor).ask(CountChildren(), timeout)
+            except HoldfastError as error:
+                return [*problems, f"{name} does not answer: {error}"]
+            if counts.active < counts.specs:
+                problems.append(f"{counts.specs - counts.active} of {counts.specs} children of {name} do not run")
         silent, waits = await asyncio.gather(silent_at_root(system), _waits(system, timeout))
         return [*problems, *(f"the process of {path} does not answer" for path in silent), *waits]
 

@@ -93,17 +93,17 @@ def _class_named(ref: ActorRef[Any], name: str) -> type[Message[Any]]:
 
 
 def is_plain(value: Any) -> bool:
-    """Whether a value consists of what JSON has.
+    """Whether a value consists of what JSON has; a tuple is a list there.
 
     >>> is_plain({"a": [1, None, "b", 0.5]}), is_plain((1, 2)), is_plain({1: "a"}), is_plain(1 << 64)
-    (True, False, False, False)
+    (True, True, False, False)
     """
     match value:
         case None | bool() | float():
             return True
         case int():
             return -LARGEST <= value < LARGEST
-        case list():
+        case list() | tuple():
             return all(map(is_plain, value))
         case dict():
             return all(type(key) is str for key in value) and all(map(is_plain, value.values()))

@@ -141,8 +141,8 @@ class _Flow:
     """What is seen of one topic."""
 
     __slots__ = (
-        "began", "came_in", "guess", "in_block", "is_cut", "is_missed", "last", "lives", "missed", "out_of_block",
-        "poor", "recent", "seen", "works",
+        "began", "came_in", "guess", "in_block", "inputs", "is_cut", "is_missed", "last", "lives", "missed",
+        "out_of_block", "poor", "recent", "seen", "works",
     )  # fmt: skip
 
     began: float
@@ -154,6 +154,7 @@ class _Flow:
         self.lives: tuple[int, ...] = ()  # of its publishers
         self.is_cut = False  # one of them was started again since the last message
         self.is_missed = False  # it should flow, and does not
+        self.inputs = set[str]()  # what it was made from when the last message came, or since
         self.guess = self.seen = self.missed = 0
         self.begin(now)
 
@@ -201,9 +202,10 @@ class FlowObserver(Observer):
     """Says `ok(topic)` while a topic flows, and that it does not where it should.
 
     A topic should flow while its inputs come; one without inputs, while its publishers have turns, or if it goes by a
-    clock. It is silent for too long after four times what came in, and after four times what has passed, between two
-    messages at most so far. Of what comes in, at least half of the usual part must go out. Until enough was heard, and
-    while nothing comes in, nothing is known.
+    clock. What its publishers hear no more is an input until a message goes out without it. It is silent for too long
+    after four times what came in, and after four times what has passed, between two messages at most so far. Of what
+    comes in, at least half of the usual part must go out. Until enough was heard, and while nothing comes in, nothing
+    is known.
 
     Args:
         made: topic to how it comes about; it may change.
@@ -266,6 +268,7 @@ class FlowObserver(Observer):
                     learned.take(gap, flow.came_in)
                     flow.seen += flow.came_in > 0
             flow.last, flow.came_in = now, 0
+            flow.inputs.intersection_update(self._made[topic].inputs)
             flow.out_of_block += 1
         for user in self._users.get(topic, ()):
             user.came_in += 1
@@ -290,8 +293,10 @@ class FlowObserver(Observer):
                 self._flows[new] = _Flow(self._time.now())
         self._users = {}
         for topic, made in self._made.items():
-            for wanted in made.inputs:
-                self._users.setdefault(wanted, []).append(self._flows[topic])
+            flow = self._flows[topic]
+            flow.inputs.update(made.inputs)
+            for wanted in flow.inputs:
+                self._users.setdefault(wanted, []).append(flow)
         self._learn_from_before()
         for topic, made in self._made.items():
             self.verdict(ok(word_for(topic)), self._flows_well(topic, made))
@@ -329,7 +334,7 @@ class FlowObserver(Observer):
         cells = self._publishers(made)
         works = [cell.host.work(cell) for cell in cells]
         flow.look_at(cells)
-        if not made.inputs:  # Its publishers' turns are what comes in.
+        if not flow.inputs:  # Its publishers' turns are what comes in.
             had_turns = len(works) == len(flow.works) and any(map(_had_turns, flow.works, works))
             flow.came_in, flow.works = flow.came_in + had_turns, works
             for cell in cells:
@@ -341,11 +346,11 @@ class FlowObserver(Observer):
             return True if silent < self._patience else None
         is_long = silent > max(self._patience, LONGER * learned.longest_gap)
         is_due = flow.came_in > ENOUGH // 2 + LONGER * flow.most_in(learned)
-        is_by_clock = not made.inputs and learned.goes_by_clock
+        is_by_clock = not flow.inputs and learned.goes_by_clock
         if (is_due and silent > self._patience) or (is_by_clock and is_long):
             flow.is_missed = True
             return False
-        if made.inputs and flow.in_block >= BLOCK and all(map(_is_idle, cells, works)):  # All of it was worked off.
+        if flow.inputs and flow.in_block >= BLOCK and all(map(_is_idle, cells, works)):  # All of it was worked off.
             flow.end_block(learned)
         if flow.poor > 1:
             return False

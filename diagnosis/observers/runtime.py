@@ -10,8 +10,8 @@ from collections.abc import Collection, Iterable, Mapping
 from typing import Any, Final, NamedTuple
 
 from ...actors.control.orders_lane import OrderAsk
-from ...actors.errors import AskTimeout
-from ...actors.events import ActorCrashed, ChildTerminated, EventStream
+from ...actors.errors import ActorStopped, AskTimeout
+from ...actors.events import ActorCrashed, ChildTerminated, DeadLetter, EventStream
 from ...actors.exit_reasons import Crash, Normal
 from ...actors.kernel.address_host import Work
 from ...actors.kernel.cell import RUNNING, Cell
@@ -25,6 +25,7 @@ from ..literals import Literal, crashes, keeps_up, progress, replies, room, wait
 from .backlog import Backlog
 from .node_observer import at_root
 from .observer import Manner, Observer
+from .refusals import Refusals
 
 LOOKS: Final = 20
 """Looks in which an actor must have got on before a long turn of it says anything: until then only time-outs do."""
@@ -70,6 +71,8 @@ class _Seen:
     """When asks of it have failed, and when they were made."""
     refused: float = -math.inf
     """When it has refused what it was asked for the last time."""
+    no: Ask | None = None
+    """The ask that it has refused then."""
     crashes: tuple[float, ...] = ()
     backlog: Backlog = dataclasses.field(default_factory=Backlog)
     waited: deque[str] = dataclasses.field(default_factory=lambda: deque(maxlen=USUAL))
@@ -145,6 +148,7 @@ class RuntimeObserver(Observer):
         self._rests_until = 0.0
         self._loops: set[str] = set()  # who ends again and again
         self._let_down: dict[str, float] = {}  # when an ask of theirs has failed
+        self._refusals = Refusals(2 * self.manner.every)
         self._waiting: set[Literal] = set()
 
     def on_start(self, restored: bool) -> None:
@@ -187,6 +191,7 @@ class RuntimeObserver(Observer):
             seen.waited.clear()
             seen.full = None
             seen.backlog.clear()
+        self._refusals.forget(names)
 
     # -- looking ----------------------------------------------------------------------------------------------------
 
@@ -200,7 +205,7 @@ class RuntimeObserver(Observer):
         for gone in self._known.keys() - self._actors.keys():
             del self._known[gone]
         self._take_failures(names)
-        self._take_crashes(names)
+        self._take_ends(names)
         waits, asked_since = self._waits(names, now)
         shown: dict[str, _Shown] = {}
         for component, path in self._actors.items():
@@ -265,26 +270,31 @@ class RuntimeObserver(Observer):
         for ask, error in failed:
             callee = names.get(ask.to.path)
             asker = names.get(ask.sender.path) if ask.sender is not None else None
-            if isinstance(
-                error, Refusal
-            ):  # That is an answer, and says nothing of whether it could have given another.
+            if asker is not None and callee not in (None, asker) and chain_of(ask):
+                self._asked.setdefault(asker, set()).add(callee)
+            # That is an answer, and says nothing of whether it could have given another.
+            if isinstance(error, Refusal):
                 if callee is not None:
-                    self._seen(callee).refused = self.now
+                    self._seen(callee).refused, self._seen(callee).no = self.now, ask
+                    self._refusals.take(asker, callee, error, self.now)
                 continue
             if callee is not None and isinstance(error, AskTimeout):
                 self._seen(callee).unanswered.append((self.now, self.now - ask.timeout))
-            if asker is not None and asker != callee:
+            is_nobody = callee is None and isinstance(error, ActorStopped)  # That it asks there is its own fault.
+            if asker is not None and asker != callee and not is_nobody:
                 self._let_down[asker] = self.now
-                if callee is not None and chain_of(ask):
-                    self._asked.setdefault(asker, set()).add(callee)
 
-    def _take_crashes(self, names: Mapping[str, str]) -> None:
+    def _take_ends(self, names: Mapping[str, str]) -> None:
         """Ends by themselves; who could not bear that another one did not answer is not to blame."""
         assert self._stream is not None
         for event in self._stream.take():
+            component = names.get(event.address)
             match event:
                 case ActorCrashed(reason=Crash() as reason) | ChildTerminated(reason=Normal() as reason):
-                    component = names.get(event.address)
+                    pass
+                case DeadLetter() if component is not None:
+                    self._refusals.take_end(component, event, self.now)
+                    continue
                 case _:
                     continue
             was_let_down = self.now - self._let_down.get(component or "", -math.inf) <= 2 * self.manner.every
@@ -309,6 +319,8 @@ class RuntimeObserver(Observer):
         has_got_on = seen.take(work, cell.life, now, self._patience)
         has_moved = has_got_on or work.own_turns != seen.own_turns
         seen.own_turns, seen.moved = work.own_turns, now if has_moved else seen.moved
+        if has_got_on and work.has_answered and work.newest is not seen.no:
+            self._refusals.answers(component)
         waits_now = sorted(waits.get(component, ()))
         seen.waited.append(waits_now[0] if waits_now else "")
         usual = max(self._patience, LONGER * seen.longest)
@@ -398,6 +410,9 @@ class RuntimeObserver(Observer):
         seen, now, keeps = self._known[component], self.now, self.manner.time_to_live
         was = None if now - max(seen.since, seen.moved) > keeps else self._kept(progress(component))
         self.verdict(progress(component), True if of_it.has_got_on else was)
+        if self._refusals.lets_down(component, now):
+            self._deny(replies(component))
+            return
         has_refused = now - seen.refused <= keeps
         was = self._kept(replies(component))
         self.verdict(replies(component), None if has_refused else True if of_it.has_answered else was)

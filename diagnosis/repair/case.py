@@ -62,6 +62,7 @@ class Case:
         before_plan: how many actions there were before the present plan.
         undos: how the present plan can be taken back, newest last.
         advised: the advice for each candidate.
+        useless: places of actions that were seen not to help.
         others: when each component was started by somebody else.
         awaited: whom its supervisor was at work on when repair last looked.
         held: what repair waits for, as it was last told.
@@ -83,6 +84,7 @@ class Case:
     before_plan: int = 0
     undos: list[tuple[Step, Undo]] = dataclasses.field(default_factory=list[tuple[Step, Undo]])
     advised: dict[tuple[str, ...], Advice] = dataclasses.field(default_factory=dict[tuple[str, ...], Advice])
+    useless: set[int] = dataclasses.field(default_factory=set[int])
     others: dict[str, float] = dataclasses.field(default_factory=dict[str, float])
     held: str = ""
     awaited: set[str] = dataclasses.field(default_factory=set[str])
@@ -115,6 +117,14 @@ class Case:
         """The steps of the present plan that were begun, once: then they are judged."""
         steps, self.before_plan = tuple(self.actions[self.before_plan :]), len(self.actions)
         return steps
+
+    def note_useless(self, steps: tuple[Step, ...]) -> None:
+        """The steps that were taken last to be judged have not helped."""
+        self.useless.update(range(self.before_plan - len(steps), self.before_plan))
+
+    def helpful(self) -> tuple[Step, ...]:
+        """The actions that were done, but for those that were seen not to help."""
+        return tuple(step for place, step in enumerate(self.actions) if place not in self.useless)
 
     def take_back_plan(self, bad: tuple[str, ...]) -> None:
         """Nothing of the plan was tried, so it does not count."""

@@ -87,7 +87,7 @@ class Held(Message):
 
 
 class Repaired(Message):
-    """The symptoms are gone, and that was observed. `actions`: all that were done."""
+    """The symptoms are gone, and that was observed. `actions`: those that were done, without what has not helped."""
 
     case: int
     actions: tuple[Step, ...]

@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Final
 
@@ -355,7 +354,7 @@ class Repairer(Actor):
                 self._memory.score.add(verdict, saved)
                 await self._tell(say.AdviceScored(case.number, verdict, saved))
             elif decision.is_repaired:
-                await self._tell(say.Repaired(case.number, tuple(case.actions), self.now() - case.began))
+                await self._tell(say.Repaired(case.number, case.helpful(), self.now() - case.began))
         finally:
             self._case = None
         self._begin()
@@ -461,7 +460,7 @@ class Repairer(Actor):
         what = ", ".join(map(str, plan.steps))
         reason = f"{', '.join(bad)} {'is' if len(bad) == 1 else 'are'} diagnosed"
         wanted = say.ApprovalWanted(case.number, plan.steps, reason, policy.approval)
-        why = await self._approvals.ask(wanted, self._tell, self._others_blamed(case, bad))
+        why = await self._approvals.ask(wanted, self._tell, self._withdrawn(case, bad))
         if why is None and self._chosen(case) != bad:
             return deciding.Enter()  # Nobody was needed, or others need something first.
         if why is None:
@@ -475,14 +474,15 @@ class Repairer(Actor):
     def _is_dangerous(self, step: Step) -> bool:
         return self._policy.is_dangerous(step.action, self._actions[step.action].is_dangerous)
 
-    async def _others_blamed(self, case: Case, bad: tuple[str, ...]) -> None:
-        """Return when another candidate is to be acted on, and the diagnosis has stood for a while."""
+    async def _withdrawn(self, case: Case, bad: tuple[str, ...]) -> None:
+        """Return when another candidate is to be acted on, or the fault has gone, and that has stood for a while."""
         while True:
             left = self._outlook.diagnosed + self._policy.settle - self.now()
-            is_same = self._chosen(case) in (None, bad)
-            if not is_same and left <= 0:
+            chosen, is_gone = self._chosen(case), self._outlook.diagnosis.state is State.HEALTHY
+            is_wanted = chosen == bad or (chosen is None and not is_gone)
+            if not is_wanted and left <= 0:
                 return
-            await self._sleep(math.inf if is_same else left, wakes=True)
+            await self._sleep(math.inf if is_wanted else left, wakes=True)
 
     async def _take_back(self, case: Case) -> None:
         """If the plan has not helped, count it, and undo of it what can be undone, the newest first."""
@@ -491,6 +491,7 @@ class Repairer(Actor):
         if not steps or not suspects & case.midway:
             return  # It was judged before, or others are blamed now: it may have helped.
         self._memory.useless += 1
+        case.note_useless(steps)
         node, now = self.ctx._cell.node, self.now()
         for step in steps:
             address = self._addresses.get(step.args[0]) if step.args and step.args[0] in suspects else None
@@ -617,9 +618,9 @@ class Repairer(Actor):
 
     async def _tell(self, message: say.CaseNotice) -> None:
         if text := sentence(message):
-            what = type(message).__name__
-            self._memory.stories.add(message.case, say.StoryEntry(time.time(), what, text, about(message)))
-            self.ctx._cell.node.emit(say.RepairTold(self.ctx.path, message.case, what, text))
+            what, node = type(message).__name__, self.ctx._cell.node
+            self._memory.stories.add(message.case, say.StoryEntry(node.clock.wall(), what, text, about(message)))
+            node.emit(say.RepairTold(self.ctx.path, message.case, what, text))
         await self.ctx.publish(say.TOPIC, message)
         await self._keep()
 

@@ -21,11 +21,14 @@ from ...supervision.admin import ChildBusy, ChildParked, RestartChild, Terminate
 from ...supervision.arbiter import OPERATOR, InOtherHands
 from ..board import SwitchChannel
 from .actions import Act, ActionFailed, RepairAction, Run, Undo
+from .ping import looked_at
 
 PATIENCE: Final = 10.0
 """Seconds for a supervisor or a board to answer."""
 CHANGED_WITHIN: Final = 30.0
 """Seconds in which a mechanism must have been changed."""
+SILENT: Final = 0.5
+"""Seconds without an answer of its process after which an actor is not asked to end, but killed."""
 OUTPUT: Final = 500
 """Characters of a failed command's output that are told."""
 
@@ -194,8 +197,10 @@ async def _stop(act: Act, node: str, *, addresses: Mapping[str, str], timeout: f
 async def _restart(act: Act, node: str, *, addresses: Mapping[str, str], timeout: float, older: bool = False) -> None:
     address = addresses[node]
     keeper, child = _keeper(act, address)
+    is_silent = await looked_at(act.ctx._cell.node, address, SILENT) is None
     act.check()
-    order = RestartChild(child, running=True, unless_parked=True, older=older, blames_turn=True)
+    # Who hears nothing would have all of its `shutdown`, for nothing.
+    order = RestartChild(child, running=True, unless_parked=True, older=older, blames_turn=True, at_once=is_silent)
     try:
         await _ordered(act, keeper, address, order, 2 * timeout)
     except ChildBusy as error:

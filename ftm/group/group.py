@@ -184,7 +184,7 @@ class Group:
         source = self.switch.open.get(feed.id)
         ask = None if source is None else source.ask
         if ask is not None:
-            if not ask.started and not ask.deadline:
+            if ask.started is not True and not ask.deadline:
                 # Its client was told that it has not run: no replica may find, on its own clock, that there is time.
                 feed = msgspec.structs.replace(feed, deadline=EXPIRED)
             ask.started = True

@@ -91,7 +91,7 @@ class GroupPlace(Place):
         self.last_config = 1  # that was ever given to a stack of mechanisms
         self.on_step: Callable[[str], None] | None = None  # for tests: called before each step of a failover
         self.on_switched: Callable[[], None] = lambda: None
-        self.ended_at = time.time()  # when the last group ended, by the system's clock
+        self.ended_at = home.homes.node.clock.wall()  # when the last group ended
         self.probation: Probation | None = None  # of the stack that there is, if it is not trusted yet
         self._starting: asyncio.Task[None] | None = None
         self._ending: asyncio.Task[None] | None = None
@@ -582,7 +582,7 @@ class GroupPlace(Place):
     async def dismantle(self, cell: Cell) -> None:
         """End the mechanism; returns when all of its processes have been reaped."""
         group, self.group = self.group, None
-        self.ended_at = time.time()
+        self.ended_at = cell.node.clock.wall()
         if group is not None:
             group.close("its life has ended")
             if group.replicas.link is not None:
@@ -641,6 +641,9 @@ class GroupPlace(Place):
 
     def running(self, cell: Cell) -> int:
         return -1 if self.group is None else self.group.delivery.only_suspect_input()
+
+    def may_have_begun(self, cell: Cell, key: int) -> bool:
+        return False  # Of what was given to the replicas the ask itself says so.
 
 
 def as_spec(layers: tuple[Mechanism, ...]) -> Any:

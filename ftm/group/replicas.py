@@ -113,7 +113,7 @@ class Replicas:
         self.hold = FailoverHold(cell)
         self.wrong = 0  # suspicions
         self._stirred: list[asyncio.Future[None]] = []
-        self._was_whole, self._whole_since = False, time.time()
+        self._was_whole, self._whole_since = False, self.node.clock.wall()
 
     # -- where they are ---------------------------------------------------------------------------------------------
 
@@ -336,7 +336,7 @@ class Replicas:
         """Whether one replica leads and all others could, and since when that is so (by the system's clock)."""
         is_whole = self.membership.is_whole(self.lives())
         if is_whole != self._was_whole:
-            self._was_whole, self._whole_since = is_whole, time.time()
+            self._was_whole, self._whole_since = is_whole, self.node.clock.wall()
         return is_whole, self._whole_since
 
     def stirred(self) -> asyncio.Future[None]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import msgspec
 
 from ...actors.control.orders import Status, status_of
+from ...actors.errors import DIVERGES
 from ...actors.kernel.cell import GONE
 from ...actors.kernel.envelope import NO_DEADLINE, Ask, Item, message_in
 from ...actors.process.open_asks import items_at, open_asks
@@ -20,7 +21,7 @@ from ...ftm.group.protected import ProtectionStatus, protection_of
 from ...supervision.children import STOPPED
 from ...supervision.intensity import recent_restarts
 from ...supervision.spec import ChildSpec
-from ...supervision.supervisor import Supervisor, listed_at
+from ...supervision.supervisor import IN_VAIN, Supervisor, listed_at
 from .lives import WITH_THE_ROOT, PastLife, is_fault
 from .pages import answer, question
 from .past_event import PastEvent, content, message_type, shortened
@@ -57,13 +58,18 @@ MOST_DEEPER = 10_000
 """Actors further below that are looked at."""
 MOST_TEXT = 300
 """Characters of an error that a sentence quotes."""
+ADVICE = (DIVERGES, IN_VAIN)
+"""What errors say at their end, of what is to be done: nothing that a sentence about many has room for."""
 LONG_TURN = 1.0
 """Seconds from which on a turn, or the wait of a message, is worth a sentence."""
 MADE_GOOD = (*GAVE_UP_KINDS, "RecoveryFailed")
 """Events that a life which begins behind them makes good."""
-DEEPER_KINDS = (*GAVE_UP_KINDS, "ChildRestarted", "JournalFull", "MessageQuarantined", "RecoveryFailed", "ReplicaLost")
+START_KINDS = ("ChildRestarted", "ChildStartFailed")
+"""Events of a child that is started again, of which the next program knows nothing."""
+NEWS_KINDS = (*START_KINDS, "JournalFull", "MessageQuarantined", "RecoveryFailed", "ReplicaLost")
+DEEPER_KINDS = (*GAVE_UP_KINDS, *NEWS_KINDS)
 """Events further below a supervisor of which it tells, too."""
-CHILD_KINDS = ("ChildRestarted", "JournalFull", "MessageQuarantined", "RecoveryFailed", "ReplicaLost", "StopOverdue")
+CHILD_KINDS = (*NEWS_KINDS, "StopOverdue")
 """Events of children that their supervisor is asked about, too."""
 
 
@@ -285,6 +291,22 @@ def seconds_text(seconds: float) -> str:
     return f"{seconds:.0f} s" if seconds >= 10.0 else f"{seconds:.1f} s"
 
 
+def cut(text: str, most: int = MOST_TEXT) -> str:
+    """The beginning of a text that is too long for a sentence, up to the end of a word.
+
+    >>> cut("a reason", 8), cut("a long reason", 8)
+    ('a reason', 'a long [...]')
+    """
+    return text if len(text) <= most else f"{text[: most + 1].rpartition(' ')[0] or text[:most]} [...]"
+
+
+def brief(text: str) -> str:
+    """What an error says has happened, without what is to be done about it, for a sentence."""
+    for advice in ADVICE:
+        text = text.replace(f"; {advice}", "")
+    return cut(text)
+
+
 def messages_text(count: int) -> str:
     """How many messages wait, as people say it.
 
@@ -406,8 +428,15 @@ def _deeper(recorder: HistoryRecorder, address: str) -> list[PastEvent]:
 
 
 def _not_over(recorder: HistoryRecorder, events: list[PastEvent]) -> list[PastEvent]:
-    """The events, without those that a life behind them has made good."""
-    return [event for event in events if event.kind not in MADE_GOOD or not _is_over(recorder, event)]
+    """The events, without those that a life behind them has made good, and the starts of former programs."""
+    begun = answer(recorder, question(kinds=("SystemStarted",), limit=1)).events
+    since = begun[-1].number if begun else 0
+    return [
+        event
+        for event in events
+        if not (event.kind in MADE_GOOD and _is_over(recorder, event))
+        and not (event.kind in START_KINDS and event.number < since)
+    ]
 
 
 def _is_over(recorder: HistoryRecorder, event: PastEvent) -> bool:

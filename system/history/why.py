@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from ...ftm.group.protected import ProtectionStatus
-from .evidence import GAVE_UP_KINDS, LONG_TURN, MOST_TEXT, Evidence, PutAside, messages_text, seconds_text
+from .evidence import GAVE_UP_KINDS, LONG_TURN, MOST_TEXT, Evidence, PutAside, brief, cut, messages_text, seconds_text
 from .lives import CLEAN, PastLife, is_fault
 from .past_event import PastEvent
 from .raised import raised_at
@@ -18,6 +18,7 @@ from .why_children import (
     ended_children,
     moving_children,
     overdue_children,
+    past_restarts,
     rest_below,
     restarts_of_children,
     troubled_children,
@@ -36,7 +37,8 @@ ROUNDED = 1.0
 
 AT_REST = "its turn rests"
 REST_BELOW = "turns that rest below"
-NO_TROUBLE = frozenset({AT_REST, REST_BELOW})
+PAST_RESTARTS = "restarts that are over"
+NO_TROUBLE = frozenset({AT_REST, REST_BELOW, PAST_RESTARTS})
 """Causes of which there is something to tell, while nothing is wrong."""
 
 Rule = Callable[[Evidence], list[str]]
@@ -61,7 +63,7 @@ def why(evidence: Evidence) -> list[str]:
     ['Nobody lives at /app/till, and the history knows of no life there.']
     """
     found = causes(evidence)
-    is_well = all(one.cause == REST_BELOW for one in found)
+    is_well = all(one.cause in (REST_BELOW, PAST_RESTARTS) for one in found)
     return [*([_well(evidence)] if is_well else []), *(one.sentence for one in found)]
 
 
@@ -152,7 +154,7 @@ def _one_end(evidence: Evidence, life: PastLife) -> str:
 
 def _fault(life: PastLife) -> str:
     """What has ended a life, in words."""
-    reason = life.reason[:MOST_TEXT]
+    reason = cut(life.reason)
     match life.reason_kind:
         case "Crash":
             place = raised_at(life.traceback)
@@ -192,7 +194,7 @@ def _start_fails(evidence: Evidence, loop: list[PastLife]) -> str:
     last = loop[-1]
     failures = [life for life in loop if life.reason_kind == "StartFailed"]
     times = "" if len(failures) == 1 else f" {len(failures)} times, the last time"
-    return f"{evidence.address} could not be started{times} {_ago(evidence, last)}: {last.reason[:MOST_TEXT]}."
+    return f"{evidence.address} could not be started{times} {_ago(evidence, last)}: {cut(last.reason, 2 * MOST_TEXT)}."
 
 
 # -- ends that others have called for ---------------------------------------------------------------------------------
@@ -221,7 +223,7 @@ def _given_up_above(evidence: Evidence) -> list[str]:
         if event.kind == "SupervisorGaveUp":
             said.append(
                 f"{event.address} gave up {evidence.ago(event.at)}, and all below it ended: "
-                f"{event.address}/{child} had failed too often, the last time with {str(reason)[:MOST_TEXT]}."
+                f"{event.address}/{child} had failed too often, the last time with {brief(str(reason))}."
             )
         else:
             said.append(
@@ -235,7 +237,7 @@ def _gave_up(evidence: Evidence) -> list[str]:
     event = _own_end(evidence)
     if event is None:
         return []
-    child, reason = event.fields.get("child"), str(event.fields.get("reason"))[:MOST_TEXT]
+    child, reason = event.fields.get("child"), brief(str(event.fields.get("reason")))
     ago, since = evidence.ago(event.at), _runs_since(evidence)
     then = "" if since is None or since < event.at else f", and was started again {evidence.ago(since)}"
     if event.kind == "AutoShutdown":
@@ -296,7 +298,7 @@ def _recovery_fails(evidence: Evidence) -> list[str]:
     back = _newest(evidence, "Recovered")
     if event is None or (back is not None and back.number > event.number):
         return []
-    reason = str(event.fields.get("reason", ""))[: 2 * MOST_TEXT]
+    reason = cut(str(event.fields.get("reason", "")), 2 * MOST_TEXT)
     if "diverged" in reason:
         return [f"{evidence.address} cannot be recovered, for its turns do not go as they went before: {reason}."]
     return [f"{evidence.address} could not be recovered {evidence.ago(event.at)}: {reason}."]
@@ -309,7 +311,21 @@ def _suspended(evidence: Evidence) -> list[str]:
     status = evidence.status
     if status is None or status.state != "suspended":
         return []
-    return [f"{evidence.address} is suspended: it handles nothing, and {status.queued} messages wait, until `resume`."]
+    by = _suspended_by(evidence)
+    since = "is suspended" if by is None else f"was suspended {evidence.ago(by.at)} by {by.fields.get('by')}"
+    waits = messages_text(status.queued) if status.queued else "what comes waits"
+    return [f"{evidence.address} {since}: it handles nothing, and {waits} for `resume`."]
+
+
+def _suspended_by(evidence: Evidence) -> PastEvent | None:
+    """The order that has suspended it, which later ones only repeat; None if that is not known."""
+    since, found = _newest(evidence, "ActorResumed"), None
+    begun = evidence.lives[-1].started if evidence.lives else None
+    for event in evidence.events:
+        is_later = (since is None or event.number > since.number) and event.at >= (begun or 0.0)
+        if event.kind == "ActorSuspended" and is_later:
+            found = found or event
+    return found
 
 
 def _restarting(evidence: Evidence) -> list[str]:
@@ -441,7 +457,7 @@ def _store(evidence: Evidence) -> list[str]:
     """The store fails, or is full."""
     said: dict[str, str] = {}
     for event in evidence.store:
-        reason = str(event.fields.get("reason", ""))[:MOST_TEXT]
+        reason = brief(str(event.fields.get("reason", "")))
         match event.kind:
             case "JournalGoesOn":
                 said.pop("JournalBlocked", None)
@@ -497,6 +513,7 @@ RULES: dict[str, Rule] = {
     "trouble further below": deeper_trouble,
     AT_REST: _rests,
     REST_BELOW: rest_below,
+    PAST_RESTARTS: past_restarts,
     "events left out": _gap,
 }
 """The causes, in the order in which they are told."""

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections import Counter
+import dataclasses
+from collections.abc import Callable
+from itertools import pairwise
 
-from .evidence import LONG_TURN, MOST_TEXT, ChildNow, Evidence, messages_text, seconds_text
+from .evidence import LONG_TURN, START_KINDS, ChildNow, Evidence, brief, messages_text, seconds_text
 from .past_event import PastEvent
 
 LATELY = 60.0
 """Seconds within which restarts are told, if the supervisor's period is not longer."""
 MOST_NAMED = 3
 """Children that are named in one sentence, or have a sentence each."""
+QUIET = 30.0
+"""Seconds for which one has to be up until its restarts are over."""
 NEWS = 600.0
 """Seconds for which a supervisor tells what has happened to one of its children."""
 TROUBLE = {
@@ -29,23 +33,110 @@ MOVING = {
 """What a child is in that is neither up nor stopped, in words."""
 
 
-def restarts_of_children(evidence: Evidence) -> list[str]:
-    """Which children it has restarted lately, how often, and what it allows."""
-    own = evidence.own_allowance
+@dataclasses.dataclass(frozen=True, eq=False)
+class Starts:
+    """How often one was started again of late: by event, oldest first."""
+
+    path: str
+    restarts: list[PastEvent]
+    failed: list[PastEvent]
+    """Those starts of which it has not come up."""
+    is_up: bool
+
+    @property
+    def count(self) -> int:
+        """How often it was restarted, or could not be started."""
+        return len(self.failed if self.is_in_vain else self.restarts)
+
+    @property
+    def is_in_vain(self) -> bool:
+        """Whether it has not come up: of the last start nobody may know yet."""
+        return bool(self.failed) and len(self.failed) >= len(self.restarts) - 1
+
+    def is_over(self, now: float) -> bool:
+        """Whether it is up, and has been for longer than between two restarts."""
+        times = [event.at for event in self.restarts]
+        longest = max((after - before for before, after in pairwise(times)), default=0.0)
+        return self.is_up and now - times[-1] > max(QUIET, longest)
+
+    @property
+    def reason(self) -> str:
+        """Why it was, or could not be, the last time."""
+        return brief(str((self.failed if self.is_in_vain else self.restarts)[-1].fields.get("reason")))
+
+    def told(self, now: float) -> str:
+        """How often it was, or could not be, and why."""
+        did = "could not be started" if self.is_in_vain else "was restarted"
+        return f"{did} {_times(self.count)} within the last {max(1, round(now - self.first))} s ({self.reason})"
+
+    @property
+    def first(self) -> float:
+        """When that began."""
+        return min(event.at for event in (*self.restarts, *self.failed))
+
+
+def _starts(events: list[PastEvent], since: float, is_up: Callable[[str], bool]) -> list[Starts]:
+    """Of each that was restarted, those who were most often first."""
+    lately = [event for event in events if event.kind in START_KINDS and event.at >= since]
+    found = [
+        Starts(
+            path,
+            [event for event in lately if (event.kind, event.address) == ("ChildRestarted", path)],
+            [event for event in lately if (event.kind, event.address) == ("ChildStartFailed", path)],
+            is_up(path),
+        )
+        for path in dict.fromkeys(event.address for event in lately if event.kind == "ChildRestarted")
+    ]
+    return sorted(found, key=lambda one: -one.count)
+
+
+def _restarted(evidence: Evidence, *, is_over: bool) -> list[Starts]:
+    own, up = evidence.own_allowance, {one.name for one in _in(evidence, "running")}
     since = evidence.now - max(LATELY, own.period if own is not None else 0.0)
-    lately = [event for event in evidence.below.events if event.kind == "ChildRestarted" and event.at >= since]
-    if not lately:
+    starts = _starts(evidence.below.events, since, lambda path: _name(path) in up)
+    return [one for one in starts if one.is_over(evidence.now) == is_over]
+
+
+def restarts_of_children(evidence: Evidence) -> list[str]:
+    """Which children it has restarted lately, or has tried to, how often, and what it allows."""
+    starts, own = _restarted(evidence, is_over=False), evidence.own_allowance
+    if not starts:
         return []
-    counted = Counter(event.address for event in lately).most_common(MOST_NAMED)
-    others = len({event.address for event in lately}) - len(counted)
-    named = [f"{_name(path)} {_times(count)} ({_last_reason(lately, path)})" for path, count in counted]
-    named += [f"{others} others"] if others else []
-    took = max(1, round(evidence.now - lately[0].at))
-    said = f"Within the last {took} s it restarted {', '.join(named)}"
+    said = _said_of(evidence, starts)
     if own is None:
-        return [f"{said}; it allows {lately[-1].fields.get('allowed')} within its period."]
+        allowed = max((event for one in starts for event in one.restarts), key=lambda event: event.at)
+        return [f"{said}; it allows {allowed.fields.get('allowed')} within its period."]
     left = "and gives up at the next" if own.restarts >= own.intensity else f"of which it has counted {own.restarts}"
     return [f"{said}; it allows {own.intensity} in {own.period:g} s, {left}."]
+
+
+def _restarted_deeper(evidence: Evidence, *, is_over: bool) -> list[Starts]:
+    ended = evidence.deeper.ended
+    starts = _starts(evidence.deeper.events, evidence.now - LATELY, lambda path: path not in ended)
+    return [one for one in starts if one.is_over(evidence.now) == is_over]
+
+
+def past_restarts(evidence: Evidence) -> list[str]:
+    """Who was restarted lately, of its children and further below, and has been up for a while."""
+    starts = _restarted(evidence, is_over=True)
+    said = [f"{_said_of(evidence, starts)}; that is over."] if starts else []
+    deeper = [
+        f"Below it, {one.path} {one.told(evidence.now)}; that is over."
+        for one in _restarted_deeper(evidence, is_over=True)
+    ]
+    return [*said, *_first(deeper)]
+
+
+def _said_of(evidence: Evidence, starts: list[Starts]) -> str:
+    named, others = starts[:MOST_NAMED], len(starts) - MOST_NAMED
+    told = {one: f"{_name(one.path)} {_times(one.count)} ({one.reason})" for one in named}
+    in_vain = [words for one, words in told.items() if one.is_in_vain]
+    came = [words for one, words in told.items() if not one.is_in_vain]
+    came += [f"{others} others"] if others > 0 else []
+    did = [f"restarted {', '.join(came)}"] if came else []
+    did += [f"could not start {', '.join(in_vain)}"] if in_vain else []
+    took = max(1, round(evidence.now - min(one.first for one in starts)))
+    return f"Within the last {took} s it {', and '.join(did)}"
 
 
 def ended_children(evidence: Evidence) -> list[str]:
@@ -55,10 +146,10 @@ def ended_children(evidence: Evidence) -> list[str]:
     for path, life in ended[-MOST_NAMED:]:
         ago = evidence.ago(life.ended or evidence.now)
         if life.reason_kind == "StartFailed":
-            said.append(f"Its child {_name(path)} could not be started {ago}: {life.reason[:MOST_TEXT]}.")
+            said.append(f"Its child {_name(path)} could not be started {ago}: {brief(life.reason)}.")
         else:
             by = f", by {life.by} ({life.because})" if life.by else ""
-            said.append(f"Its child {_name(path)} ended {ago} and is not there: {life.reason[:MOST_TEXT]}{by}.")
+            said.append(f"Its child {_name(path)} ended {ago} and is not there: {brief(life.reason)}{by}.")
     more = len(ended) - MOST_NAMED
     return [*said, f"{more} more of its children are not there."] if more > 0 else said
 
@@ -133,20 +224,14 @@ def _deeper_trouble(evidence: Evidence) -> dict[str, tuple[float, str]]:
             continue
         if event.kind in TROUBLE:
             add(event.address, 3.0, f"has something to tell: {TROUBLE[event.kind]} {ago}")
-        elif event.kind != "ChildRestarted":
+        elif event.kind not in START_KINDS:
             add(event.address, 5.0, f"gave up {ago}" if event.kind == "SupervisorGaveUp" else f"ended {ago}")
     for path, life in evidence.deeper.ended.items():
         if life.ended is not None and evidence.now - life.ended <= NEWS:
             ended = "could not be started" if life.reason_kind == "StartFailed" else "ended and is not there"
-            add(path, 4.0, f"{ended}, {evidence.ago(life.ended)} ({life.reason[:MOST_TEXT]})")
-    restarts = [
-        one for one in evidence.deeper.events if one.kind == "ChildRestarted" and evidence.now - one.at <= LATELY
-    ]
-    for path, count in Counter(event.address for event in restarts).items():
-        first = next(event for event in restarts if event.address == path)
-        within = max(1, round(evidence.now - first.at))
-        words = f"was restarted {_times(count)} within the last {within} s ({_last_reason(restarts, path)})"
-        add(path, 6.0 + count, words)
+            add(path, 4.0, f"{ended}, {evidence.ago(life.ended)} ({brief(life.reason)})")
+    for tried in _restarted_deeper(evidence, is_over=False):
+        add(tried.path, 6.0 + tried.count, tried.told(evidence.now))
     return found
 
 
@@ -183,11 +268,6 @@ def _at_rest(one: ChildNow) -> str:
 def _first(said: list[str]) -> list[str]:
     more = len(said) - MOST_NAMED
     return [*said[:MOST_NAMED], f"The same is true of {more} more."] if more > 0 else said
-
-
-def _last_reason(events: list[PastEvent], path: str) -> str:
-    last = next(event for event in reversed(events) if event.address == path)
-    return str(last.fields.get("reason"))[:MOST_TEXT]
 
 
 def _name(path: str) -> str:

@@ -188,9 +188,9 @@ class Arrangement:
         for place in self._told:
             cell = place.living(system._node) if not place.is_planned else None
             if cell is not None and is_elsewhere(cell):
-                flags, specs = recipe_flags(cell), recipe_specs(cell)
                 ref: ActorRef[Supervisor] = ActorRef(cell)
-                await ref.ask(ChangeSupervisor(flags=flags, children=list(specs or ())), START_TIMEOUT)
+                children = None if place.is_dynamic else list(recipe_specs(cell) or ())
+                await ref.ask(ChangeSupervisor(flags=recipe_flags(cell), children=children), START_TIMEOUT)
 
 
 def every_cell(top: Cell | None) -> Iterator[Cell]:
@@ -339,7 +339,8 @@ def _arrange(
         if one is not None:
             children[name] = one
     supervisor._children = {**children, **{name: one for name, one in known.items() if name not in children}}
-    supervisor._flags = dataclasses.replace(supervisor._flags, **place.wanted)
+    if place.wanted:
+        supervisor._set_flags(dataclasses.replace(supervisor._flags, **place.wanted))
 
 
 def _readdress(

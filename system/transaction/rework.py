@@ -7,21 +7,24 @@ tried, or, if the transaction is given up, as before: it has handled nothing in 
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 
-from ...actors.control.orders import Conclude, Order, Prepare, ReplaceCode, ReplaceState, Resume, Suspend
+from ...actors.control.orders import Conclude, Order, Prepare, ReplaceCode, ReplaceState, Resume, Suspend, next_start
 from ...actors.control.orders_lane import order
 from ...actors.errors import ActorStopped, AskFailed, ControlFailed, NotSuspended
+from ...actors.events import ActorResumed, ActorSuspended
 from ...actors.kernel import mailbox
 from ...actors.kernel.actor import Start
 from ...actors.kernel.cell import Cell
 from ...actors.migration.quiesce import ATTEMPTS
 from ...actors.process.wire.start_codec import unpack_recipe
-from ...checkpoint.home.recorded_home import switch_of
+from ...checkpoint.home.recorded_home import give_other_code, switch_of, why_in_vain
 from ...checkpoint.protocol import Snapshot
 from ...supervision.respec import respec
+from ...supervision.supervisor import listed_at, try_again
+from ..history.authors import author
 from ..live_moves import ended_too_often
 from .arrangement import busy
 from .operation import PROTECTED, StagedWork, wrong
@@ -38,6 +41,10 @@ AGAIN_AFTER = 0.02
 """Seconds after which the next life of an actor is looked for."""
 CONCLUDED_WITHIN = 60.0
 """Seconds that an actor in another process may take to hear that the transaction is over."""
+OTHER_CODE = (
+    "have its supervisor know code that fits (ChangeSupervisor), then TerminateChild, and StartChild or RestartChild"
+)
+"""What is to be done about an actor that cannot be recovered, if it is not by a change of its code alone."""
 
 
 class Rework(StagedWork):
@@ -56,6 +63,7 @@ class Rework(StagedWork):
         self._lock: asyncio.Lock | None = None  # nobody moves it meanwhile
         self._lives_ended = 0  # before they were held
         self._trouble = ""
+        self._begun_with: Start[Any] | None = None  # before it was to come back as the new class
 
     def add(self, wanted: ReplaceState | ReplaceCode) -> None:
         """One more thing.
@@ -89,9 +97,7 @@ class Rework(StagedWork):
             await self._claim(system, cell)
             life, self._held = cell.life, None
             try:
-                wanted = Prepare(self._attempt, tuple(self._wanted))
-                prepared = await system._moves.given(cell, wanted, PREPARED_WITHIN, is_alone=True)
-                self._recipe, self._saved = prepared
+                self._recipe, self._saved = await self._prepared(system, cell)
             except (AskFailed, ActorStopped):
                 if cell.life == life and cell.host.is_up(cell):
                     raise
@@ -101,6 +107,34 @@ class Rework(StagedWork):
                 continue
             self._held = (cell, cell.life)
             return
+
+    async def _prepared(self, system: ActorSystem, cell: Cell) -> tuple[bytes | None, list[bytes]]:
+        """What an actor has prepared; one that cannot be recovered by its code comes back as the class that it becomes.
+
+        Raises:
+            ControlFailed: it cannot be recovered, or not by that class either.
+        """
+        wanted = Prepare(self._attempt, tuple(self._wanted))
+        work = asyncio.ensure_future(system._moves.given(cell, wanted, PREPARED_WITHIN, is_alone=True))
+        try:
+            while not work.done():
+                if why := why_in_vain(cell):
+                    self._try_other_code(cell, why)
+                await asyncio.wait((work,), timeout=AGAIN_AFTER)
+        finally:
+            work.cancel()
+        return cast("tuple[bytes | None, list[bytes]]", work.result())
+
+    def _try_other_code(self, cell: Cell, why: str) -> None:
+        own, wanted = cell.extra().start, self._wanted[0] if len(self._wanted) == 1 else None
+        is_told = isinstance(wanted, ReplaceCode) and wanted.change is None
+        if own is None or self._begun_with is not None or not is_told or listed_at(cell.parent) is None:
+            raise ControlFailed(cell.path, "prepare", f"it cannot be recovered: {why}; {OTHER_CODE}")
+        assert isinstance(wanted, ReplaceCode)
+        self._begun_with = own
+        respec(cell, next_start(cell, wanted.start, keeps_arguments=wanted.keeps_arguments), is_lent=True)
+        give_other_code(cell)
+        try_again(cell)
 
     async def _claim(self, system: ActorSystem, cell: Cell) -> None:
         """Have nobody else move it."""
@@ -138,6 +172,7 @@ class Rework(StagedWork):
         if self._is_ordered:
             if self.suspended is not None:
                 self._tell(cell, Suspend() if self.suspended else Resume())
+                self._report(cell)
             return
         self._put_recipe(cell)
         switch = switch_of(cell)
@@ -145,6 +180,11 @@ class Rework(StagedWork):
             for piece in self._saved:
                 switch.from_life(SNAPSHOT.decode(piece))
         self._tell(cell, Conclude(self._attempt, True, self.suspended))
+        self._report(cell)
+
+    def _report(self, cell: Cell) -> None:
+        if self.suspended is not None:
+            cell.node.emit((ActorSuspended if self.suspended else ActorResumed)(cell.path, author()))
 
     def _put_recipe(self, cell: Cell) -> None:
         """The next lives begin as the new class, wherever the actor is."""
@@ -211,6 +251,10 @@ class Rework(StagedWork):
         try:
             if cell is not None and self._lock is not None:
                 concluded = order(cell, Conclude(self._attempt, False, None), CONCLUDED_WITHIN)
+                if self._begun_with is not None:
+                    respec(cell, self._begun_with, is_lent=True)
+                    cell.kill()  # If it has come back: as the class that it is not to become.
+                    self._held = None
                 if self._held is None:  # It has not come to it so far, and obeys this behind it.
                     concluded.add_done_callback(seen)
                 else:

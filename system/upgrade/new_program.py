@@ -11,14 +11,14 @@ from typing import Any, cast
 
 from ...actors.errors import HoldfastError, SpecError, error_text, type_name
 from ...actors.kernel.actor import Start
-from ...actors.persistence import child_key
+from ...actors.persistence import child_key, plan_key
 from ...actors.process.fork.preload import attempt, load_main
 from ...checkpoint.home.homes import Homes
 from ...checkpoint.recovery_file import RecoveryFile
 from ...checkpoint.store_tools.rerun import Recipe
 from ...checkpoint.store_tools.upgrade_check import AddressCheck
 from ...supervision.dynamic import MADE_UP
-from ...supervision.noted import unpack_noted
+from ...supervision.noted import noted_plan, unpack_noted
 from ...supervision.spec import NAMELESS, ChildSpec, Plan
 from ...supervision.supervisor import Supervisor
 from ..mechanism_notes import MechanismNotes
@@ -128,6 +128,12 @@ class NewProgram:
         if not spec.is_supervisor:
             return
         plan = self._plan(path, spec)
+        given = self._homes.noted(plan_key(path)) if spec.start.kind.init is Supervisor.init else None
+        if given is not None:
+            try:
+                plan = noted_plan(plan, given)
+            except HoldfastError as error:
+                self._unasked[path] = str(error)
         for one in plan.children:
             if one.id != NAMELESS and not spec.start.kind._is_dynamic:
                 self._take(f"{path}/{one.id}", one)
@@ -151,7 +157,7 @@ class NewProgram:
         where = child_key(path, "")
         for key, data in self._homes.notes(where).items():
             name = key.removeprefix(where)
-            if "/" in name or data == MADE_UP:
+            if not name or "/" in name or data == MADE_UP:
                 continue
             try:
                 self._take(f"{path}/{name}", unpack_noted(path, template, name, data)[0])

@@ -32,6 +32,7 @@ from .livelock import Rounds
 from .numbered import NumberedFuture, NumberedTask
 from .places import SimulatedPlace, inside, is_dead, never, no_more
 from .strategies import Explored
+from .world import EPOCH
 
 if TYPE_CHECKING:
     from .choices import Choices, Keys
@@ -81,7 +82,7 @@ class ControlledLoop(VirtualClockLoop):
 
     def __init__(self, *, ticks: int = TICKS) -> None:
         self.control: Control | None = None
-        super().__init__(ticks=ticks)
+        super().__init__(epoch=EPOCH, ticks=ticks)
         self.due = DueQueue()
         self._ready: Any = self.due
         self._own_thread = threading.get_ident()

@@ -139,11 +139,7 @@ class World:
             numpy.set_state(self._own_numpy_state)
 
     def _put_clocks(self) -> None:
-        clock, put = self._loop.time, self._swaps.put
-
-        def wall() -> float:
-            return EPOCH + clock()
-
+        clock, wall, put = self._loop.time, self._loop.unix_time, self._swaps.put
         clocks = [
             ("time", wall),
             *((name, clock) for name in ("monotonic", "perf_counter", "process_time", "thread_time")),

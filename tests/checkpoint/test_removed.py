@@ -25,9 +25,96 @@ BETWEEN = "tests/checkpoint/test_between_lives.py"
 ORDER = "tests/checkpoint/test_order.py"
 REGISTRY = "tests/supervision/test_registry_recorded.py"
 ORDERS = "tests/checkpoint/test_restart_orders.py"
+TO_THE_GONE = "tests/checkpoint/test_ties_to_the_gone.py"
+ONCE = "tests/checkpoint/test_orders_once.py"
 GIVEN_UP = "tests/checkpoint/test_given_up.py"
+WITHDRAWN = "tests/checkpoint/test_withdrawn.py"
 
 CHECKS = {
+    "who is told that it was not handled is told behind the store": Check(
+        "checkpoint/home/admission.py",
+        "        home.journal.submit(Withdrawal(home, source, then))\n",
+        "        then(True)\n",
+        GIVEN_UP,
+        "the_next_program_handles and queued and hybrid",
+    ),
+    "what was put aside has begun": Check(
+        "checkpoint/home/journal_home.py",
+        "if source.was_cut or source.was_stashed or",
+        "if source.was_cut or",
+        GIVEN_UP,
+        "the_next_program_handles and stashed and hybrid",
+    ),
+    "a turn may have ended in a process, and the root has not heard of it": Check(
+        "checkpoint/home/journal_home.py",
+        "        return may_have_begun(worker.page[0], key)\n",
+        "        return key == input_of(worker.page[0])\n",
+        WITHDRAWN,
+        "was_not_heard_of and process",
+    ),
+    "a tie to somebody who does not come back is over": Check(
+        "checkpoint/durable_links.py",
+        "                if absent.is_gone(path):\n",
+        "                if False:\n",
+        TO_THE_GONE,
+        "told_of_once and made and house and task",
+    ),
+    "who waits hears of a supervisor that begins without the other one": Check(
+        "checkpoint/home/absent.py",
+        "            for ties in self._waiting.pop(path):\n                ties.end(path)\n",
+        "            self._waiting.pop(path)\n",
+        TO_THE_GONE,
+        "told_of_once and watcher and task",
+    ),
+    "a tie does not go over to whoever has the same id now": Check(
+        "checkpoint/durable_links.py",
+        "elif other is not others.get(path) and absent.is_another(other):",
+        "elif False:",
+        TO_THE_GONE,
+        "told_of_once and stranger and task",
+    ),
+    "who goes on with what is recorded is waited for": Check(
+        "checkpoint/home/absent.py",
+        "return name not in listed and not self._may_return(at)",
+        "return name not in listed",
+        TO_THE_GONE,
+        "may_come_back and keyed",
+    ),
+    "a child of a list that was not started yet is waited for": Check(
+        "checkpoint/home/absent.py",
+        "return name not in listed and not self._may_return(at)",
+        "return not self._may_return(at)",
+        TO_THE_GONE,
+        "may_come_back and listed",
+    ),
+    "a child that its supervisor has brought back is the same one": Check(
+        "checkpoint/home/absent.py",
+        "if is_anew(one) and (above is None or one.name not in self._listed.get(above.path, ())):",
+        "if is_anew(one):",
+        TO_THE_GONE,
+        "may_come_back and journaled and house",
+    ),
+    "a process says whose id is made up": Check(
+        "actors/process/process_host.py",
+        '                node.cell_at(data["path"]).extra().ties.is_anew = True\n',
+        "                pass\n",
+        TO_THE_GONE,
+        "told_of_once and stranger and made and process",
+    ),
+    "an order is an output of its turn": Check(
+        "checkpoint/life/recorded_context.py",
+        "            self.recorded.put(order, cell.path)\n",
+        "            super()._order(cell, order)\n",
+        ONCE,
+        "test_it_is_carried_out_once and task",
+    ),
+    "an order that nothing grants is refused where it is given": Check(
+        "checkpoint/life/recorded_context.py",
+        "                cell.require_order(order)\n",
+        "                pass\n",
+        ONCE,
+        "test_a_process_orders_those_alone",
+    ),
     "a recorded holder is found when it lives again": Check(
         "checkpoint/home/switch.py",
         "for come in self.node.awaited.pop(self.path, ()):",
@@ -79,7 +166,7 @@ CHECKS = {
     ),
     "a turn waits for no message whose asker has given up": Check(
         "checkpoint/long_waits.py",
-        "return is_wanted and not (source.begins_by and self._home.node.clock.is_past(source.begins_by))",
+        "return is_wanted and not self._is_given_up(source)",
         "return is_wanted",
         GIVEN_UP,
         "not_served and hybrid-task-waited",
@@ -842,8 +929,8 @@ CHECKS = {
     ),
     "a turn that rests is not blamed for the end of its process": Check(
         "checkpoint/life/recorded_life.py",
-        "0 if how and self.waits.resting else ",
-        "",
+        "OVER if how and self.waits.resting else how",
+        "how",
         "tests/effects/test_long_waits.py",
         "test_a_turn_waits_on_whatever_ends and process",
     ),
@@ -919,8 +1006,8 @@ CHECKS = {
     ),
     "what ends the process beside a turn is what is blamed": Check(
         "checkpoint/life/glances.py",
-        "        life.page[0] = feed.id + 1",
-        "        life.page[0] = 0",
+        "        life.word.look(feed.id)",
+        "        life.word.mark(1 << 62)",
         "tests/effects/test_glances.py",
         "test_one_that_ends_the_process",
     ),

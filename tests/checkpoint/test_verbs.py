@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -274,6 +275,7 @@ def forbidden(ctx: Any, ref: hf.ActorRef[Any]) -> dict[str, Any]:
     return {
         "tell": lambda: ctx._tell(ref._cell, Act()),
         "ask": lambda: ctx._ask(ref._cell, Act(), 1.0),
+        "kill": lambda: ctx._order(ref._cell, "kill"),
         "every": lambda: ctx.every(NEVER, Tick("x")),
         "tell_after": lambda: ctx.tell_after(NEVER, Tick("x")),
         "subscribe": lambda: ctx.subscribe("/x"),
@@ -390,3 +392,14 @@ async def test_what_was_promised_and_put_aside_is_taken_up_in_on_start(isolation
             async with asyncio.timeout(30.0):
                 while await ref.ask(Heard(), timeout=30.0) != ["one", "two"]:
                     await asyncio.sleep(0)
+
+
+def test_each_public_name_has_its_row() -> None:
+    """Whatever `self.ctx`, a ref or a handle can do stands in the table."""
+    page = (Path(__file__).parents[2] / "docs/recovery/verbs.md").read_text()
+    table = page.partition("## The table")[2].partition("The words in the cells mean")[0]
+    rows = (line.split("|")[1] for line in table.splitlines() if line.startswith("| `"))
+    told = {name.removeprefix("ref.") for row in rows for name in re.findall("`(.*?)`", row)}
+    kinds = (hf.ActorContext, hf.ActorRef, hf.Timer, hf.Monitor, hf.ReplyHandle)
+    names = {name for kind in kinds for name in vars(kind) if not name.startswith("_")}
+    assert names == told - {"self.ctx"}

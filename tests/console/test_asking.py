@@ -30,6 +30,12 @@ class Everything(hf.Message[dict[str, Any]]):
 class Pair(hf.Message[tuple[int, int]]): ...
 
 
+class Grades(hf.Message[dict[str, tuple[float, int]]]): ...
+
+
+class Seats(hf.Message[dict[int, str]]): ...
+
+
 class Never(hf.Message): ...
 
 
@@ -52,6 +58,14 @@ class Clerk(hf.Actor):
     @hf.on(Everything)
     def everything(self, message: Everything) -> dict[str, Any]:
         return {"whole": message.whole, "names": list(message.names), "to": message.to.path, "more": message.more}
+
+    @hf.on(Grades)
+    def grades(self, message: Grades) -> dict[str, tuple[float, int]]:
+        return {"ann": (0.5, 1)}
+
+    @hf.on(Seats)
+    def seats(self, message: Seats) -> dict[int, str]:
+        return {1: "ann"}
 
     @hf.on(Pair)
     def pair(self, message: Pair) -> tuple[int, int]:
@@ -101,8 +115,10 @@ async def test_fields_are_json_and_refs_are_addresses(socket: Path) -> None:
     given = {"whole": 7, "names": ["a", "ü"], "to": "/app/process", "more": {"x": 1}}
     status, output = await said(socket, "ask", "/app/plain", "Everything", json.dumps(given))
     assert (status, json.loads(output)) == (0, {**given, "more": {"x": 1.0}})
-    assert await said(socket, "ask", "/app/plain", "Pair") == (0, "(1, 2)")
-    assert await said(socket, "ask", "/app/plain", "Pair", "--json") == (0, '{"text": "(1, 2)"}')
+    assert await said(socket, "ask", "/app/plain", "Pair") == (0, "[1, 2]")
+    assert await said(socket, "ask", "/app/plain", "Grades", "--json") == (0, '{"reply": {"ann": [0.5, 1]}}')
+    assert await said(socket, "ask", "/app/plain", "Seats") == (0, "{1: 'ann'}")
+    assert await said(socket, "ask", "/app/plain", "Seats", "--json") == (0, '{"text": "{1: \'ann\'}"}')
     assert await said(socket, "ask", "/app/plain", "Far", "--json") == (0, '{"reply": "nothing"}')
 
 
@@ -114,7 +130,10 @@ async def test_a_supervisor_is_asked_too(socket: Path) -> None:
 
 BAD = {
     "no actor": (("/app/nobody", "Far"), "there is no actor at /app/nobody"),
-    "no class": (("/app/plain", "Near"), "it does not handle 'Near', but Everything, Far, Never, Pair, Refuse"),
+    "no class": (
+        ("/app/plain", "Near"),
+        "it does not handle 'Near', but Everything, Far, Grades, Never, Pair, Refuse",
+    ),
     "no json": (("/app/plain", "Far", "{text"), "malformed"),
     "no object": (("/app/plain", "Far", "[1]"), "the fields are a JSON object"),
     "no field": (("/app/plain", "Far", '{"txt": "a"}'), "it has no field 'txt', but text"),

@@ -114,6 +114,22 @@ async def test_a_child_that_is_away_makes_it_not_ready() -> None:
         assert (await service.live()).is_good  # It will come back: another program would not help.
 
 
+async def test_so_does_a_child_of_a_supervisor_that_is_watched() -> None:
+    async with Service(system(), watch=["/app/inner"]) as service:
+        service.up()
+        assert (await service.ready()).text.startswith("/app/inner does not answer: ")
+        child = hf.child("fragile", hf.start(Fragile), backoff=hf.Backoff(initial=60.0, maximum=60.0))
+        await service.system.start(hf.supervisor("inner", children=[child]))
+        assert (await service.ready()).text == "ok"
+        fragile = service.system.ref("/app/inner/fragile", Fragile)
+        async with asyncio.timeout(20):
+            fragile.tell(Break())
+            while (verdict := await service.ready()).is_good:
+                await asyncio.sleep(0)
+        assert verdict.text == "1 of 1 children of /app/inner do not run"
+        assert (await service.live()).is_good
+
+
 async def test_a_child_whose_process_is_silent_makes_it_not_ready() -> None:
     async with Service(system()) as service:
         kept = await service.system.start(hf.child("kept", hf.start(Counter), isolation="process"))
@@ -233,6 +249,7 @@ async def test_only_the_master_of_several_workers_talks_to_the_service_manager(t
         ({"workers": 2}, "several workers need a store each"),
         ({"workers": 0}, "a number from 1 on"),
         ({"patience": -1.0}, "patience"),
+        ({"watch": "/app/inner"}, "addresses, not one text"),
         ({"probes": "8080"}, "must be HOST:PORT"),
         ({"probes": "host:http"}, "must be HOST:PORT"),
     ],

@@ -61,6 +61,12 @@ async def test_a_system_is_found_by_its_name_and_by_its_pid(named: hf.ActorSyste
         assert (status, output.split()[0]) == (DONE, "/app")
 
 
+async def test_why_without_an_address_is_that_of_the_root(named: hf.ActorSystem) -> None:
+    status, output, _ = await holdfast("why")
+    assert (status, output) == (DONE, (await holdfast("why", "/app"))[1])
+    assert output.startswith("/app ")
+
+
 async def test_no_system_and_several_are_told_apart(named: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch) -> None:
     status, _, errors = await holdfast("tree", "--system", "till")
     assert status == UNUSABLE

@@ -310,6 +310,27 @@ CHECKS = {
         LIVE,
         "test_an_actor_that_is_terminated_at_once_does_not_end_its_turn",
     ),
+    "starts of a former program are told no more": Check(
+        "system/history/evidence.py",
+        "event.kind in START_KINDS and event.number < since",
+        "False",
+        LIVE,
+        "does_not_come_up_with_a_release",
+    ),
+    "a transaction that suspends is named": Check(
+        "system/transaction/rework.py",
+        "        self._tell(cell, Conclude(self._attempt, True, self.suspended))\n        self._report(cell)\n",
+        "        self._tell(cell, Conclude(self._attempt, True, self.suspended))\n",
+        LIVE,
+        "suspended_and_full and unrecorded-task",
+    ),
+    "no word is cut": Check(
+        "system/history/evidence.py",
+        "text[: most + 1].rpartition(' ')[0] or text[:most]",
+        "text[:most]",
+        WHY,
+        "long and reason",
+    ),
     "a sibling's end is told": Check(
         "supervision/supervisor.py",
         "                tell_stopped(cell, self.ctx.path if by is None else by, because)\n",

@@ -6,6 +6,7 @@ import pytest
 
 import holdfast as hf
 from holdfast.ftm.group.protected import ProtectionStatus
+from holdfast.supervision.supervisor import IN_VAIN
 from holdfast.system.history.evidence import (
     Allowance,
     Below,
@@ -49,6 +50,9 @@ CRASHES = [
 
 PastLife = hf.system.PastLife
 ROOT_KILLED = life(1, 990.0, "the process of the root was killed", "RootKilled", by="the program")
+
+SHORTLY = str(hf.errors.ReplayDiverged(f"{AT}/a", 1, 2, what="effect luck")).partition("; ")[0]
+WENT_ASTRAY = f"{hf.errors.ReplayDiverged(f'{AT}/a', 1, 2, what='effect luck')}; {IN_VAIN}"
 
 NO_WORD = f"The process of {AT} (pid 7) has not answered within 5.0 s"
 
@@ -237,7 +241,28 @@ CASES: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "suspended": (
         {"status": status("suspended", queued=7)},
-        f"{AT} is suspended: it handles nothing, and 7 messages wait, until `resume`.",
+        f"{AT} is suspended: it handles nothing, and 7 messages wait for `resume`.",
+    ),
+    "suspended, by whom is known": (
+        {
+            "status": status("suspended", queued=1),
+            "lives": [life(1)],
+            "events": [
+                told("ActorSuspended", at=900.0, number=1, by="the program"),
+                told("ActorResumed", at=950.0, number=2, by="the program"),
+                told("ActorSuspended", at=990.0, number=3, by="an operator"),
+                told("ActorSuspended", at=995.0, number=4, by="/app/desk"),
+            ],
+        },
+        f"{AT} was suspended 10 s ago by an operator: it handles nothing, and 1 message waits for `resume`.",
+    ),
+    "suspended in another life, and again": (
+        {
+            "status": status("suspended"),
+            "lives": [PastLife(2, started=995.0)],
+            "events": [told("ActorSuspended", at=990.0, by="an operator")],
+        },
+        f"{AT} is suspended: it handles nothing, and what comes waits for `resume`.",
     ),
     "its start waits": (
         {"awaited": "/app/desk"},
@@ -317,6 +342,68 @@ CASES: dict[str, tuple[dict[str, Any], str]] = {
             "Within the last 15 s it restarted a 2 times (KeyError: 8), b once (SIGKILL); it allows 3 in 5 s, "
             "and gives up at the next."
         ),
+    ),
+    "a child that does not come up again": (
+        {
+            "below": Below(
+                events=[
+                    told("ChildRestarted", f"{AT}/b", 990.0, reason="SIGKILL", allowed=3),
+                    *(
+                        told(kind, f"{AT}/a", at, reason=WENT_ASTRAY, allowed=3)
+                        for at in (970.0, 985.0)
+                        for kind in ("ChildRestarted", "ChildStartFailed")
+                    ),
+                ],
+                now=[ChildNow("b", "running")],
+            ),
+        },
+        (
+            f"Within the last 30 s it restarted b once (SIGKILL), and could not start a 2 times ({SHORTLY}); "
+            "it allows 3 within its period."
+        ),
+    ),
+    "restarts of a child that is up again": (
+        {
+            "is_there": True,
+            "status": status(),
+            "below": Below(
+                events=[
+                    told("ChildRestarted", f"{AT}/a", at, reason="KeyError: 7", allowed=3) for at in (942.0, 950.0)
+                ],
+                now=[ChildNow("a", "running")],
+            ),
+        },
+        "Within the last 58 s it restarted a 2 times (KeyError: 7); that is over.",
+    ),
+    "restarts of one further below that is up again": (
+        {
+            "deeper": Below(
+                [told("ChildRestarted", f"{AT}/a/b", at, reason="KeyError: 7") for at in (942.0, 950.0)],
+            ),
+            "is_there": True,
+            "status": status(),
+        },
+        f"Below it, {AT}/a/b was restarted 2 times within the last 58 s (KeyError: 7); that is over.",
+    ),
+    "one further below that does not come up": (
+        {
+            "deeper": Below(
+                events=[
+                    *(
+                        told(kind, f"{AT}/a/b", at, reason=WENT_ASTRAY)
+                        for at in (960.0, 970.0)
+                        for kind in ("ChildRestarted", "ChildStartFailed")
+                    ),
+                    told("ChildRestarted", f"{AT}/a/b", 990.0, reason=WENT_ASTRAY),
+                ],
+                ended={f"{AT}/a/b": life(1, 970.0, WENT_ASTRAY, "StartFailed")},
+            ),
+        },
+        f"Below it, {AT}/a/b could not be started 2 times within the last 40 s ({SHORTLY}): ask why of {AT}/a/b.",
+    ),
+    "a long reason": (
+        {"below": Below(ended={f"{AT}/a": life(1, 998.0, "because " * 100, "StartFailed")})},
+        f"Its child a could not be started 2.0 s ago: {'because ' * 37}[...].",
     ),
     "a child restarted, and the supervisor is silent": (
         {"below": Below(events=[told("ChildRestarted", f"{AT}/a", reason="KeyError: 7", allowed=3)])},

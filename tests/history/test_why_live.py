@@ -5,9 +5,9 @@ import dataclasses
 import os
 import re
 import signal
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 
@@ -406,13 +406,82 @@ async def test_a_turn_that_rests_as_it_has_said(
         assert "Its child sleeper does not get on" in await said(system, "/app")
 
 
-async def test_suspended_and_full(system: hf.ActorSystem) -> None:
-    ref = await system.start(worker())
-    await system.suspend(ref)
-    for _ in range(150):
-        ref.tell(Do("well"))
-    assert "/app/worker is suspended: it handles nothing, and 150 messages wait" in await said(system, ref)
-    await system.resume(ref)
+@pytest.mark.parametrize("isolation", ["task", "process"])
+@pytest.mark.parametrize("recovery", [None, hf.hybrid()], ids=["unrecorded", "recorded"])
+async def test_suspended_and_full(system: hf.ActorSystem, recovery: Any, isolation: Any) -> None:
+    ref = await system.start(worker(recovery=recovery, isolation=isolation))
+    waits = "it handles nothing, and 150 messages wait for `resume`."
+    with system.events() as events:
+        await system.suspend(ref)
+        assert (await events.until(hf.events.ActorSuspended)).by == "the program"
+        for _ in range(150):
+            ref.tell(Do("well"))
+        assert re.fullmatch(rf"/app/worker was suspended 0\.\d s ago by the program: {waits}", await said(system, ref))
+        await system.resume(ref)
+        assert (await events.until(hf.events.ActorResumed)).address == ref.path
+    await ref.ask(Do("well"), 20.0)
+    async with system.transaction() as change:
+        change.suspend(ref)
+    assert "ago by the program: it handles nothing, and what comes waits for `resume`." in await said(system, ref)
+    async with system.transaction() as change:
+        change.resume(ref)
+    assert "nothing is wrong" in await said(system, ref)
+
+
+class Sit(hf.Message[None]): ...
+
+
+def luck() -> int:
+    return 7
+
+
+def fate() -> int:
+    return 8
+
+
+class Sitting(hf.Actor):
+    """Waits for days; a release that has another effect before that cannot go on with what was begun."""
+
+    draws: ClassVar[Callable[[], int]] = luck
+
+    @hf.on(Sit)
+    async def sit(self, message: Sit) -> None:
+        await self.ctx.effect(type(self).draws)
+        await self.ctx.sleep(1e6)
+
+
+async def test_who_does_not_come_up_with_a_release_was_not_restarted_and_with_the_old_one_all_is_well(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store, backoff = f"sqlite:{tmp_path / 'app.db'}", hf.Backoff(initial=0.05, maximum=0.05)
+    template = hf.child(None, hf.start(Sitting), recovery=hf.hybrid(), backoff=backoff)
+    exam = hf.supervisor("exam", children=[hf.dynamic("hall", template=template, journal=True, intensity=1000)])
+    async with hf.ActorSystem("app", store=store, log=False) as system:
+        await system.start(exam)
+        ann = await system.ref("/app/exam/hall", hf.Supervisor).ask(hf.StartChild(id="ann"))
+        ann.tell(Sit())
+        await until(lambda: "it has slept" in heard(system, system.ref("/app/exam/hall")))
+    monkeypatch.setattr(Sitting, "draws", fate)
+    async with hf.ActorSystem("app", store=store, log=False) as system:
+        with system.events() as events:
+            await system.start(exam)
+            for _ in range(3):
+                await events.until(hf.events.ChildStartFailed)
+        above, own = await said(system, "/app/exam"), await said(system, "/app/exam/hall")
+        assert re.search(r"Below it, /app/exam/hall/ann could not be started \d+ times within the last 1 s \(", above)
+        assert re.search(r"it could not start ann \d+ times \(", own)
+        for told in (above, own):
+            assert "diverged at turn 1" in told
+            assert "effect" in told
+            assert "restarted" not in told
+            assert "ctx.now()" not in told
+    monkeypatch.setattr(Sitting, "draws", luck)
+    async with hf.ActorSystem("app", store=store, log=False) as system:
+        await system.start(exam)
+        await until(lambda: "it has slept" in heard(system, system.ref("/app/exam/hall")))
+        told = await said(system, "/app/exam")
+        assert "nothing is wrong" in told
+        assert "start" not in told
 
 
 @pytest.mark.parametrize("isolation", ["task", "process"])

@@ -63,6 +63,10 @@ class New(hf.Actor):
         return [type(self).__name__, os.getpid(), self.hundredths // 100, self.peer.path]
 
 
+class Wrong(Old):
+    """A release that does not fit what the last one has recorded."""
+
+
 def back(state: dict[str, Any]) -> dict[str, Any]:
     return {"step": state["step"], "total": state["hundredths"] // 100}
 
@@ -94,12 +98,17 @@ def trees(kind: str, place: Isolation = "task") -> list[hf.ChildSpec]:
     if kind == "plain":
         team = hf.supervisor("team", children=[member(name) for name in NAMES], intensity=100, isolation=place)
     else:
-        team = hf.dynamic("team", template=member(None) if kind == "template" else None, journal=True, intensity=100)
+        template = member(None) if kind == "template" else None
+        team = hf.dynamic("team", template=template, journal=True, intensity=100, isolation=place)
     return [*first, hf.supervisor("others", children=[IN], intensity=100), team]
 
 
-async def begin(system: hf.ActorSystem, kind: str) -> None:
-    for tree in trees(kind):
+def of_template() -> list[hf.ChildSpec]:
+    return trees("template", "process")
+
+
+async def begin(system: hf.ActorSystem, kind: str, place: Isolation = "task") -> None:
+    for tree in trees(kind, place):
         await system.start(tree)
 
 
@@ -163,6 +172,40 @@ async def and_back(system: hf.ActorSystem, kind: str) -> None:
         await come(system, kind, "gone")
 
 
+TEMPLATE = hf.child(None, hf.start(New), recovery=hf.hybrid(), bindings=BOUND)
+RENEWALS = ("template, transactions", "template, one transaction", "template, orders", "orders, template")
+
+
+async def renewed(system: hf.ActorSystem, renewal: str) -> None:
+    """All children, and those that come later, are of the next release."""
+    await come(system, "template", "one", "two")
+    for name in ("one", "two"):
+        await system.ref(at(name)).ask(Count())
+    for step in renewal.split(", "):
+        await _renew(system, step)
+    await come(system, "template", "three")
+    for name in ("one", "two", "three"):
+        await system.ref(at(name)).ask(Count())
+
+
+async def _renew(system: hf.ActorSystem, step: str) -> None:
+    match step:
+        case "template":
+            await system.ref("/app/team", hf.Supervisor).ask(hf.supervision.ChangeSupervisor(children=[TEMPLATE]))
+        case "one transaction":
+            async with system.transaction() as change:
+                for name in ("one", "two"):
+                    change.replace_code(at(name), New)
+        case "transactions":
+            for name in ("one", "two"):
+                async with system.transaction() as change:
+                    change.replace_code(at(name), New)
+        case _:
+            for name in ("one", "two"):
+                await system.replace_code(await paused(system, name), New)
+                await system.resume(system.ref(at(name)))
+
+
 async def paused(system: hf.ActorSystem, name: str) -> hf.ActorRef[Any]:
     await system.suspend(system.ref(at(name)))
     return system.ref(at(name))
@@ -188,13 +231,17 @@ Step = Callable[[hf.ActorSystem, str], Awaitable[None]]
 DIRECTIONS: dict[str, tuple[Step, ...]] = {"there": (there,), "back": (there, and_back)}
 
 
-async def first(store: str, kind: str, direction: str, *, is_killed: bool) -> dict[str, list[Any]]:
+async def first(
+    store: str, kind: str, direction: str, place: Isolation = "task", *, is_killed: bool
+) -> dict[str, list[Any]]:
     """A first program; it dies in the end, or ends in order."""
     async with hf.ActorSystem("app", store=store, log=False, intensity=100) as system:
-        await begin(system, kind)
-        for step in DIRECTIONS[direction]:
+        await begin(system, kind, place)
+        if direction in RENEWALS:
+            await renewed(system, direction)
+        for step in DIRECTIONS.get(direction, ()):
             await step(system, kind)
-        seen = await looks(system)
+        seen = await looks(system) if place == "task" else {}  # What specs say in a process, only that reads.
         if is_killed:
             print(json.dumps(seen), flush=True)
             os.kill(os.getpid(), signal.SIGKILL)
@@ -205,4 +252,5 @@ def main() -> None:
     """Live the first program, with the arguments of the command, and die."""
     for name, value in PROBATION.items():
         setattr(probation, name, value)
-    asyncio.run(first(*sys.argv[1:4], is_killed=True))
+    store, kind, direction, place = sys.argv[1:]
+    asyncio.run(first(store, kind, direction, "process" if place == "process" else "task", is_killed=True))

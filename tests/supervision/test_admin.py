@@ -325,3 +325,22 @@ async def test_calls_to_a_supervisor_that_is_not_there_say_so() -> None:
         for call in (WhichChildren(), StartChild(kid("x")), TerminateChild("x")):
             with pytest.raises(hf.ActorStopped):
                 await top.ask(call)
+
+
+@pytest.mark.parametrize(
+    ("order", "text"),
+    [
+        (TerminateChild("p"), "TerminateChild(id='p')"),
+        (RestartChild("p", running=True), "RestartChild(id='p', running=True)"),
+        (StartChild(args=(1,), id="p"), "StartChild(args=(1,), id='p')"),
+        (DeleteChild("p", erase=False), "DeleteChild(id='p', erase=False)"),
+    ],
+)
+def test_the_text_of_an_order_has_what_was_given(order: hf.Message[Any], text: str) -> None:
+    assert repr(order) == text
+
+
+def test_the_text_of_a_spec_has_what_a_user_can_say() -> None:
+    text = repr(hf.child("kid", hf.start(Kid)))
+    assert "start=Start(kind=<class 'tests.supervision.test_admin.Kid'>)" in text
+    assert not [name for name in ("begins_with", "comes_back", "made_up", "late", "unless") if f"{name}=" in text]

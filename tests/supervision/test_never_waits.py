@@ -15,10 +15,10 @@ virtual = pytest.mark.asyncio(loop_factories=["virtual"])
 
 
 def supervisors() -> Iterator[type[hf.Supervisor]]:
-    """All supervisor classes of the package, those of mechanisms among them."""
+    """All supervisor classes of the package, those of mechanisms and of their replicas among them."""
     for room in ("supervision", "ftm", "system", "checkpoint", "diagnosis"):
         package = importlib.import_module(f"holdfast.{room}")
-        for found in pkgutil.iter_modules(package.__path__, f"{package.__name__}."):
+        for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
             importlib.import_module(found.name)
     waiting = [hf.Supervisor]
     while waiting:
@@ -39,9 +39,8 @@ def test_no_handler_of_a_supervisor_can_wait() -> None:
     assert not found
     starts = {kind for kind in supervisors() if inspect.iscoroutinefunction(vars(kind).get("on_start"))}
     assert starts == {hf.Supervisor}  # Its own start is an errand, too.
-    assert {"Supervisor", "DynamicSupervisor", "PoolSupervisor", "PartitionSupervisor"} <= {
-        kind.__name__ for kind in supervisors()
-    }
+    names = {kind.__name__ for kind in supervisors()}
+    assert {"Supervisor", "DynamicSupervisor", "PoolSupervisor", "PartitionSupervisor", "Replica"} <= names
 
 
 class Block(hf.Message): ...

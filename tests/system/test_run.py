@@ -110,3 +110,56 @@ def test_a_signal_stops_all_actors_in_good_order(
     assert output.splitlines() == ["/app/top/b shutdown", "/app/top/a shutdown", "over"]
     assert program.returncode == code
     assert errors.rstrip().rpartition("\n")[2] == traceback
+
+
+STUBBORN = """
+import asyncio, sys
+import holdfast as hf
+from holdfast.system import run
+
+async def swallows():
+    while True:
+        try:
+            await asyncio.Event().wait()
+        except asyncio.CancelledError:
+            pass
+
+class Kid(hf.Actor):
+    async def on_stop(self, reason):
+        await swallows()
+
+async def main(beside, waits):
+    run.ENDS_WITHIN = 0.1
+    task = asyncio.create_task(swallows(), name="beside") if beside else None
+    async with hf.ActorSystem("app", log=False) as system:
+        await system.start(hf.child("kid", hf.start(Kid), shutdown=0.1))
+        print("up", flush=True)
+        if waits:
+            await asyncio.Event().wait()
+    print("left", flush=True)
+
+if __name__ == "__main__":
+    how, beside = sys.argv[1:]
+    (asyncio.run if how == "asyncio" else hf.run)(main(beside == "beside", how == "signal"))
+"""
+
+
+@pytest.mark.parametrize(
+    ("how", "beside"), [("signal", ""), ("signal", "beside"), ("return", ""), ("return", "beside"), ("asyncio", "")]
+)
+def test_what_swallows_its_cancellation_keeps_no_program_alive(how: str, beside: str, tmp_path: Path) -> None:
+    script = tmp_path / "program.py"
+    script.write_text(STUBBORN, "utf-8")
+    with subprocess.Popen(
+        [sys.executable, str(script), how, beside], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as program:
+        try:
+            assert program.stdout is not None
+            assert program.stdout.readline() == "up\n"
+            if how == "signal":
+                program.send_signal(signal.SIGTERM)
+            _, errors = program.communicate(timeout=SECONDS)
+        finally:
+            program.kill()
+    assert program.returncode == (143 if how == "signal" else 0), errors
+    assert ("beside was cancelled, and does not end" in errors) == bool(beside)

@@ -8,6 +8,7 @@ TABLE = "tests/upgrades/test_what_a_change_does.py"
 READ = "tests/upgrades/test_where_records_are_read.py"
 MAPPING = "tests/upgrades/test_mapping.py"
 UNFIT = "tests/checkpoint/test_unfit_states.py"
+BEYOND = "tests/upgrades/test_beyond_recovery.py"
 
 CODE = "tests/control/test_code.py"
 
@@ -165,6 +166,41 @@ CHECKS = {
         "                pass",
         UNFIT,
         "test_a_supervisor_gives_up_at_once",
+    ),
+    "a class that fits is tried for a child that cannot be recovered": Check(
+        "system/transaction/rework.py",
+        "        self._begun_with = own\n        respec(",
+        '        raise ControlFailed(cell.path, "prepare", why)\n        respec(',
+        BEYOND,
+        "test_a_class_that_fits",
+    ),
+    "an attempt by order does not count": Check(
+        "supervision/children.py",
+        "        actor._start_now(item.child, item.number)\n",
+        "        actor._retry(item.child, item.number, item.reason)\n",
+        BEYOND,
+        "test_a_class_that_fits",
+    ),
+    "a child that cannot be recovered is not waited for": Check(
+        "system/transaction/rework.py",
+        "                if why := why_in_vain(cell):\n",
+        '                if why := "":\n',
+        BEYOND,
+        "test_what_cannot_be_tried",
+    ),
+    "what a process says of a failed start is remembered": Check(
+        "actors/kernel/address_host.py",
+        "            up.add_done_callback(self._started)\n",
+        "            pass\n",
+        BEYOND,
+        "test_what_was_tried",
+    ),
+    "a class that was tried is taken back": Check(
+        "system/transaction/rework.py",
+        "                    respec(cell, self._begun_with, is_lent=True)\n",
+        "",
+        BEYOND,
+        "test_what_was_tried",
     ),
 }
 

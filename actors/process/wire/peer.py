@@ -16,7 +16,7 @@ from ...errors import AskDeadlock, BadMessage, BadReply, HoldfastError, type_nam
 from ...exit_reasons import ExitReason, pack_exit, unpack_exit
 from ...kernel import links
 from ...kernel.address_host import AddressHost, Capacity, Home, Place, Work
-from ...kernel.cell import Cell
+from ...kernel.cell import Cell, Order
 from ...kernel.codec import Codec, Parcel, Raw
 from ...kernel.envelope import Ask, Chain, Envelope, Item, chain_of, message_in, waiters
 from ...kernel.lifecycle import NEAR
@@ -464,12 +464,15 @@ class OutsidePlace(Place):
     def start(self, cell: Cell) -> None:
         raise HoldfastError(f"{cell.path} is in another process")
 
+    def require_order(self, cell: Cell, order: Order) -> None:
+        self.peer.require_granted(cell.path, order)
+
     def stop(self, cell: Cell, reason: ExitReason) -> None:
-        self.peer.require_granted(cell.path, "stop")
+        self.require_order(cell, "stop")
         self.told(cell, "stop", {"reason": pack_exit(reason)})
 
     def kill(self, cell: Cell) -> None:
-        self.peer.require_granted(cell.path, "kill")
+        self.require_order(cell, "kill")
         self.told(cell, "kill", {})
 
     def control(self, cell: Cell, call: QueuedOrder) -> None:

@@ -177,6 +177,14 @@ class WorkerGate:
         if not self.owns(path) and (cell is None or not is_granted(path, cell, self._bound(cell))):
             raise BadFrame(f"{what} to {path}, which {self.home} has neither started nor is bound to")
 
+    def order(self, path: str, order: str) -> None:
+        """An order to whoever lives at an address, which must be one that anybody may give there."""
+        self.require_granted(path, repr(order))
+        try:
+            self._node.cell_at(path).require_order("stop" if order == "stop" else "kill")
+        except NotGranted as error:
+            raise BadFrame(str(error)) from error
+
     def _bound(self, own: Cell) -> Iterator[Cell]:
         """Whose bindings grant it something: its actors, and the one that it speaks for, whose replica it is."""
         yield own
@@ -426,7 +434,7 @@ def _keep(gate: WorkerGate, to: str, frame: frames.Command) -> None:
 
 def _order(gate: WorkerGate, to: str, frame: frames.Command) -> None:
     """An order to a life."""
-    gate.require_granted(to, repr(frame.verb))
+    gate.order(to, frame.verb)
     if frame.verb == "stop":
         unpack_exit(frame.data.get("reason"))
     if frame.verb == "faulted" and (by := text(frame, "by")):

@@ -233,7 +233,9 @@ def test_an_actor_is_suspended_resumed_stopped_and_started(page: Page) -> None:
     expect(state).to_have_text("running")
     verb(page, "suspend")
     expect(state).to_have_text("suspended")
-    expect(page.locator("main section").first).to_contain_text("until `resume`")
+    expect(page.locator("main section").first).to_contain_text(
+        "by an operator: it handles nothing, and what comes waits for `resume`."
+    )
     verb(page, "resume")
     expect(state).to_have_text("running")
     verb(page, "stop")

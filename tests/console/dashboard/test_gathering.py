@@ -286,7 +286,7 @@ async def test_a_system_without_a_history_is_shown(tmp_path: Path) -> None:
             assert "/app/alone" in paths(await seen(stream))
             told = await stream.until("troubles", lambda data: data["troubles"])
             assert [one["sentences"] for one in told["troubles"]] == [
-                ["/app/alone is suspended: it handles nothing, and 0 messages wait."]
+                ["/app/alone is suspended: it handles nothing, and what comes waits for `resume`."]
             ]
         await app.close()
         await browser.http.aclose()

@@ -16,10 +16,10 @@ from tests.diagnosis.foreign.systems import SYSTEMS
 from tests.diagnosis.foreign.trials import TRAFFICS, run
 
 
-def healthy(name: str, kind: str, seed: int, hours: float) -> tuple[tuple[str, ...], float]:
+def healthy(name: str, kind: str, seed: int, hours: float, refusals: float) -> tuple[tuple[str, ...], float]:
     """Run a system under traffic for `hours` virtual hours; the false alarms, and the seconds of a core it took."""
     (foreign,) = (one for one in SYSTEMS if one.name == name)
-    return run(foreign, {}, kind, seed, hours * 3600.0).false_alarms, time.process_time()
+    return run(foreign, {}, kind, seed, hours * 3600.0, refusals).false_alarms, time.process_time()
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -28,6 +28,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("hours", type=float, help="virtual hours of each system under each kind of traffic")
     parser.add_argument("--only", default="", help="a part of the names to run, such as pipeline or bursty")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument(
+        "--refusals", type=float, default=0.0, help="the part of all asks that services refuse as usual"
+    )
     parser.add_argument("--jobs", type=int, default=2, help="processes at a time")
     options = parser.parse_args(arguments)
     days = [(one.name, kind) for one in SYSTEMS for kind in TRAFFICS if options.only in f"{one.name} {kind}"]
@@ -35,7 +38,7 @@ def main(arguments: list[str] | None = None) -> int:
         parser.error(f"no system and no traffic is called {options.only!r}")
     alarms = 0
     with ProcessPoolExecutor(options.jobs, get_context("spawn"), max_tasks_per_child=1) as pool:
-        running = {pool.submit(healthy, *day, options.seed, options.hours): day for day in days}
+        running = {pool.submit(healthy, *day, options.seed, options.hours, options.refusals): day for day in days}
         for done in as_completed(running):
             name, kind = running[done]
             said, seconds = done.result()

@@ -30,6 +30,9 @@ PAIRS = [
     for kind in TRAFFICS
     if pair[0][0] != pair[1][0] and not any((fault, kind) in NO_FAULTS for _, fault in pair)
 ]
+KINDS = sorted({kind for _, (_, kind), _ in ALL})
+SELECTED = random.Random(14).sample(KINDS, 6)
+"""Kinds of which one fault each is tried when there is no time for all."""
 TRIALS = int(os.environ.get("HOLDFAST_FOREIGN", "0"))
 """Rounds over all faults and traffics; 0: a small selection."""
 
@@ -43,9 +46,11 @@ async def test_traffic_is_no_fault(foreign: Foreign, kind: str, seed: int) -> No
 
 
 @VIRTUAL
-@pytest.mark.parametrize("number", range(6))
+@pytest.mark.parametrize("number", range(len(SELECTED)))
 async def test_the_root_cause_is_named_first(number: int) -> None:
-    foreign, fault, kind = random.Random(number).choice(ALL)
+    rng = random.Random(number)
+    chosen = SELECTED[number]
+    foreign, fault, kind = rng.choice([one for one in ALL if one[1][1] == chosen])
     print(f"{foreign.name}: {fault}, {kind} traffic, seed {number}")
     said = await trial(foreign, dict([fault]), kind, number)
     assert (said.false_alarms, said.first) == ((), (fault[0],))

@@ -88,20 +88,25 @@ async def _mend(system: hf.ActorSystem, faults: Faults, names: Collection[str]) 
     """Take away what is wrong with these, and begin them anew, as a person would who was told of them."""
     for name in names:
         del faults.of[name]
-        with contextlib.suppress(hf.HoldfastError):  # It is being restarted at just this moment.
-            await system.ref("/app/all", hf.Supervisor).ask(hf.RestartChild(name, running=True))
+        with contextlib.suppress(hf.HoldfastError):
+            keeper = system.ref("/app/all", hf.Supervisor)
+            await keeper.ask(hf.TerminateChild(name), timeout=WITHIN)  # It may be starting, or hang in its end.
+            await keeper.ask(hf.RestartChild(name))
 
 
 def _names(components: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(name.rpartition("/")[2] for name in components)
 
 
-async def trial(foreign: Foreign, struck: dict[str, str], kind: str, seed: int, healthy: float = 0.0) -> Outcome:
+async def trial(
+    foreign: Foreign, struck: dict[str, str], kind: str, seed: int, healthy: float = 0.0, refusals: float = 0.0
+) -> Outcome:
     """Let a system run, change its traffic, and strike it; it is looked at `healthy` seconds longer before that.
 
     `struck`: what is wrong with whom then, all at once; with nobody the trial ends before.
+    `refusals`: the part of what they are asked that services refuse as usual.
     """
-    faults = Faults()
+    faults = Faults(refusals=refusals, rng=random.Random(seed))
     said: list[tuple[float, Diagnosis]] = []
     loop = asyncio.get_running_loop()
     async with under_traffic(foreign, faults, kind, seed) as system:
@@ -146,6 +151,8 @@ def in_its_own_loop(trial: Coroutine[Any, Any, T]) -> T:
         return runner.run(trial)
 
 
-def run(foreign: Foreign, struck: dict[str, str], kind: str, seed: int, healthy: float = 0.0) -> Outcome:
+def run(
+    foreign: Foreign, struck: dict[str, str], kind: str, seed: int, healthy: float = 0.0, refusals: float = 0.0
+) -> Outcome:
     """Run one trial in a loop of its own, for as long as it takes."""
-    return in_its_own_loop(trial(foreign, struck, kind, seed, healthy))
+    return in_its_own_loop(trial(foreign, struck, kind, seed, healthy, refusals))

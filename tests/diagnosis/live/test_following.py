@@ -10,8 +10,9 @@ from holdfast import diagnosis
 from holdfast.actors.events import ActorCrashed
 from holdfast.diagnosis.engine import State
 from holdfast.diagnosis.generate import generate
-from holdfast.diagnosis.literals import word_for
-from holdfast.diagnosis.observers import Limits, Property
+from holdfast.diagnosis.literals import ok, word_for
+from holdfast.diagnosis.model import Expectation
+from holdfast.diagnosis.observers import Limits, Manner, Observer, Property
 from holdfast.testing import advance
 
 pytestmark = pytest.mark.asyncio(loop_factories=["virtual"])
@@ -210,3 +211,37 @@ async def test_lives_of_another_actor_at_the_address_are_no_restarts(system: hf.
     await exchange(system)
     seen = {str(atom) for atom in (await watching.observed()).negative if str(atom).endswith(".restarts)")}
     assert seen == set()
+
+
+class Silent(Observer):
+    """It says of each component on its list that its own atom does not hold."""
+
+    def __init__(self, *atoms: str) -> None:
+        super().__init__(manner=Manner(every=0.5, time_to_live=3.0))
+        self._atoms = atoms
+
+    def look(self) -> None:
+        for atom in self._atoms:
+            self.verdict(ok(atom), False)
+
+
+async def test_what_is_expected_of_ones_own_observer_is_kept_while_the_model_follows(system: hf.ActorSystem) -> None:
+    system.spawn(hf.start(Ear, "/a"))
+    keeper = await system.start(hf.supervisor("all", children=[hf.child("a", hf.start(Talker))]))
+    noise = diagnosis.observer("noise", hf.start(Silent, "noise"))
+    expected = [Expectation("ok(noise)", ("all/a",))]
+    watching = await diagnosis.watch(system, None, [noise], expect=expected, seconds=2.5, repair="off")
+    await advance(3.0)
+    assert (await watching.diagnosis()).certain == ("all/a",)
+    await keeper.ask(hf.StartChild(hf.child("b", hf.start(Talker))))
+    await advance(5.0)
+    found = await watching.diagnosis()
+    assert set(found.components) == {"all/a", "all/b"}
+    assert found.certain == ("all/a",)
+    assert (await watching.why()).refused == ()
+
+
+async def test_what_is_expected_of_nobody_is_refused(system: hf.ActorSystem) -> None:
+    await system.start(hf.child("pump", hf.start(Ear, "/a")))
+    with pytest.raises(ValueError, match=r"ok\(noise\) is expected of 'pumb', .* did you mean 'pump'"):
+        await diagnosis.watch(system, expect=[Expectation("ok(noise)", ("pumb",))], seconds=0.5, repair="off")

@@ -40,6 +40,30 @@ class User(hf.Actor):
     def take(self, message: Reading) -> None: ...
 
 
+class Deafen(hf.Message): ...
+
+
+class Filter(hf.Actor):
+    """Publishes what it hears, and what it is told."""
+
+    def on_start(self, restored: bool) -> None:
+        self.ctx.subscribe("/t")
+
+    @hf.on(Reading)
+    async def take(self, message: Reading) -> None:
+        await self.ctx.publish("/out", message)
+
+    @hf.on(Deafen)
+    def deafen(self, message: Deafen) -> None:
+        self.ctx.unsubscribe("/t")
+
+
+class OutUser(hf.Actor):
+    @hf.subscribe("/out")
+    @hf.on(Reading)
+    def take(self, message: Reading) -> None: ...
+
+
 async def feed(source: hf.ActorRef[Source], seconds: float) -> None:
     loop = asyncio.get_running_loop()
     until, number = loop.time() + seconds, 0
@@ -78,6 +102,28 @@ async def test_that_a_quick_topic_falls_silent_is_seen_soon_after(event: str) ->
             await asyncio.sleep(0.1)
         await asyncio.sleep(6.0)
         assert [one.bad for one in (await watching.diagnosis()).candidates] == [("source",)]
+
+
+@pytest.mark.asyncio(loop_factories=["virtual"])
+@pytest.mark.parametrize("goes_on", [False, True])
+async def test_who_has_lost_its_input_is_named_and_who_does_without_is_not(goes_on: bool) -> None:
+    async with hf.ActorSystem("t", log=False, seed=1) as system:
+        source = await started(system)
+        outside = await system.start(hf.child("filter", hf.start(Filter)))
+        await system.start(hf.child("out", hf.start(OutUser)))
+        watching = await diagnosis.watch(system, repair="off")
+        for number in range(60):  # In bursts: it goes by no clock.
+            for _ in range(1 + number % 7):
+                source.tell(Reading(number))
+            await asyncio.sleep(0.2 + number % 3)
+        outside.tell(Deafen())
+        if goes_on:
+            await asyncio.sleep(2.0)
+            outside.tell(Reading(0))
+        for number in range(60):
+            source.tell(Reading(number))
+            await asyncio.sleep(0.5)
+        assert (await watching.diagnosis()).certain == (() if goes_on else ("filter",))
 
 
 @pytest.mark.asyncio(loop_factories=["uvloop"])

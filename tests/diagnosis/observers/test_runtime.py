@@ -59,6 +59,12 @@ class Worker(hf.Actor):
                 raise Sorry
             case ["refused", address]:
                 await self.ctx.find(address, Worker).ask(Go("refuse"))
+            case ["refused", address, "by", other]:
+                await self.ctx.find(address, Worker).ask(Go(f"refused {other}"))
+            case ["gone"]:
+                gone = self.ctx.spawn(hf.start(Worker))
+                gone.kill()
+                await gone.ask(Go())
             case ["aside"]:
                 self.ctx.stash()
             case ["long", seconds]:
@@ -145,6 +151,47 @@ async def test_who_refuses_is_not_seen_to_work(system: hf.ActorSystem, asker: st
     await worker(system, "c").ask(Go())
     await advance(0.5)
     assert replies("all/c") in (await watching.observed()).positive
+
+
+@pytest.mark.parametrize("way", ["refused /t/all/c", "refused /t/all/b by /t/all/c"])
+async def test_who_only_refuses_any_more_is_named_once_turns_of_others_come_to_nothing(
+    system: hf.ActorSystem, way: str
+) -> None:
+    watching = await watched(system)
+    for turn in range(20):  # What it refuses is one thing, and what it does another.
+        worker(system, "a").tell(Go(way))
+        await advance(0.5)
+        if turn in (1, 5, 9):
+            await worker(system, "c").ask(Go())
+            await advance(0.5)
+        assert (await watching.diagnosis()).state is State.HEALTHY
+    for _ in range(8):  # Seventeen in a row: more than four times four.
+        worker(system, "a").tell(Go(way))
+        await advance(0.5)
+    assert (await watching.diagnosis()).certain == ("all/c",)
+    assert progress("all/c") in (await watching.observed()).positive
+    await worker(system, "c").ask(Go())
+    await advance(5.5)
+    assert (await watching.diagnosis()).state is State.HEALTHY
+
+
+async def test_who_was_never_seen_to_answer_otherwise_may_refuse(system: hf.ActorSystem) -> None:
+    other = await system.start(hf.child("other", hf.start(Worker)))
+    watching = await watched(system)
+    for _ in range(20):
+        worker(system, "a").tell(Go(f"refused {other.path}"))
+        await advance(0.5)
+    assert (await watching.diagnosis()).state is State.HEALTHY
+
+
+async def test_who_asks_one_that_has_ended_for_good_crashes_by_itself(system: hf.ActorSystem) -> None:
+    watching = await watched(system)
+    for _ in range(3):
+        worker(system, "a").tell(Go("gone"))
+        await advance(0.5)
+    assert crashes("all/a") in (await watching.observed()).positive
+    await advance(1.0)
+    assert (await watching.diagnosis()).certain == ("all/a",)
 
 
 async def test_in_a_circle_of_asks_all_are_certain(system: hf.ActorSystem) -> None:

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import holdfast as hf
 from holdfast.diagnosis import DIAGNOSIS, REPAIR, DiagnoserActor, observer, tree
 from holdfast.diagnosis.board import TOPIC, BoardMeasured, Load, SimulatedBoard, SwitchChannel
-from holdfast.diagnosis.engine import Diagnosis
+from holdfast.diagnosis.engine import Diagnosis, State
 from holdfast.diagnosis.model import Model, System
 from holdfast.diagnosis.observers import Agreement, Channel, GeneralObserver, HardwareObserver, Manner, NodeObserver
 from holdfast.diagnosis.repair import (
@@ -346,6 +346,13 @@ class Scene:
                 await self.news.wait()
                 self.news.clear()
         return self.all(kind)[count - 1]
+
+    async def healthy(self) -> None:
+        """Wait until the last diagnosis finds nothing bad."""
+        async with asyncio.timeout(1000):
+            while (found := self.all(Diagnosis)) == [] or found[-1].state is not State.HEALTHY:
+                await self.news.wait()
+                self.news.clear()
 
     async def rest(self, quiet: float = 8.0, most: float = 600.0) -> None:
         """Wait until repair is over and stays so; fails when it takes longer than `most` virtual seconds."""

@@ -1,6 +1,8 @@
 """A message whose turn never ends: repair restarts its actor, and the second end in a row puts the message aside."""
 
 import asyncio
+import os
+import signal
 from typing import Any
 
 import pytest
@@ -8,7 +10,7 @@ import pytest
 import holdfast as hf
 from holdfast import diagnosis
 from holdfast.diagnosis.engine import State
-from holdfast.diagnosis.repair import Policy, Repaired
+from holdfast.diagnosis.repair import Policy, Repaired, RepairTold
 
 IN_TIME = 60.0
 RESTS = [
@@ -31,6 +33,9 @@ class Spin(hf.Message): ...
 class Signal(hf.Message): ...
 
 
+class End(hf.Message): ...
+
+
 class Rest(hf.Message):
     how: str
 
@@ -50,6 +55,14 @@ class Node(hf.Actor):
     @hf.on(Signal)
     def take(self, message: Signal) -> None:
         pass
+
+    @hf.on(End)
+    def end(self, message: End) -> None:
+        self.ctx.stop()
+
+    async def on_stop(self, reason: Any) -> None:
+        if reason == hf.NORMAL:
+            await asyncio.Event().wait()
 
     @hf.on(Count)
     def count(self, message: Count) -> int:
@@ -106,6 +119,28 @@ async def test_an_actor_whose_turn_hangs_again_is_healed_by_repair(isolation: An
         assert (await watching.diagnosis()).state is State.HEALTHY
 
 
+@pytest.mark.asyncio(loop_factories=["uvloop"])
+@pytest.mark.parametrize("recovery", [None, hf.hybrid()], ids=["plain", "recorded"])
+async def test_who_hears_nothing_is_not_given_the_time_to_end(recovery: Any) -> None:
+    spec = hf.child("node", hf.start(Node), isolation="process", recovery=recovery, shutdown=30.0)
+    async with hf.ActorSystem("t", log=False) as system:
+        await system.start(hf.supervisor("all", children=[spec], intensity=20))
+        node = system.ref("/t/all/node", Node)
+        repaired = asyncio.get_running_loop().create_future()
+        system.spawn(hf.start(Listener, repaired))
+        await node.ask(Count(), timeout=IN_TIME)
+        await diagnosis.watch(system, seconds=0.1, hung_after=0.5, repair="on", policy=POLICY)
+        with system.events() as stream:
+            os.kill(system.pid_of(node), signal.SIGSTOP)
+            async with asyncio.timeout(IN_TIME):
+                while not repaired.done():
+                    await asyncio.wait([node.ask(Count(), timeout=1.0), repaired], return_when=asyncio.FIRST_COMPLETED)
+            said = [event.text for event in stream.take() if isinstance(event, RepairTold)]
+        assert not any("did not return" in text for text in said), said
+        assert await node.ask(Count(), timeout=IN_TIME) > 0
+        assert len(system.lives(node)) == 2
+
+
 @pytest.mark.parametrize("isolation", ["task", "process"])
 @pytest.mark.parametrize(("how", "recovery"), RESTS)
 async def test_a_turn_that_rests_as_it_has_said_does_not_hang(how: str, recovery: Any, isolation: Any) -> None:
@@ -134,3 +169,21 @@ async def test_a_turn_that_hangs_behind_its_rest_is_seen() -> None:
         assert (await watching.diagnosis()).state is State.HEALTHY
         await asyncio.sleep(6.0)
         assert [one.bad for one in (await watching.diagnosis()).candidates] == [("all/node",)]
+
+
+@pytest.mark.asyncio(loop_factories=["virtual"])
+async def test_who_ends_by_itself_and_hangs_in_that_is_restarted_once_its_time_to_stop_is_over() -> None:
+    spec = hf.child("node", hf.start(Node), shutdown=5.0)
+    async with hf.ActorSystem("t", log=False) as system:
+        await system.start(hf.supervisor("all", children=[spec]))
+        node = system.ref("/t/all/node", Node)
+        repaired = asyncio.get_running_loop().create_future()
+        system.spawn(hf.start(Listener, repaired))
+        await diagnosis.watch(system, seconds=0.1, repair="on", policy=POLICY)
+        node.tell(End())
+        await asyncio.sleep(4.5)
+        assert len(system.lives(node)) == 1
+        async with asyncio.timeout(IN_TIME):
+            await repaired
+        assert await node.ask(Count()) == 1
+        assert len(system.lives(node)) == 2

@@ -319,7 +319,7 @@ async def test_who_got_well_while_a_person_was_asked_is_left_alone(system: hf.Ac
     await here.change(lambda world: world.hung.add("hm"))
     wanted = await here.hear(ApprovalWanted)
     await here.change(lambda world: world.hung.discard("hm"))
-    await asyncio.sleep(5.0)
+    await here.healthy()
     await here.repairer.ask(Approve(wanted.case))
     ended = await here.hear(ActionEnded)
     assert (ended.outcome, ended.why) == (SKIPPED, "a new diagnosis finds hm good")
@@ -400,11 +400,13 @@ async def test_when_asked_repair_waits_for_each_plan_and_goes_on_when_it_may(sys
 
 
 async def test_who_got_well_before_anybody_answered_is_not_given_up(system: hf.ActorSystem) -> None:
-    here = await scene(system, Policy(approval=20.0, **QUICK), stance="ask")
+    here = await scene(system, Policy(approval=600.0, **QUICK), stance="ask")
     await here.change(lambda world: world.hung.add("hm"))
     await here.hear(ApprovalWanted)
+    begun = now()
     await here.change(lambda world: world.hung.discard("hm"))
     await here.hear(Repaired)
+    assert now() - begun < 20.0, "a person was asked about what was well"
     assert (here.all(GaveUp), here.done()) == ([], [])
 
 
@@ -433,28 +435,41 @@ async def test_no_more_actions_than_the_hour_allows(system: hf.ActorSystem) -> N
     assert (over.components, here.done()) == (("lac",), ["start_node(hm)"])
 
 
+def vain(undone: list[str], attempts: int) -> Repertoire:
+    """An action that does nothing, and notes that it was undone."""
+
+    @action(
+        "(:action reset :parameters (?n - node) :precondition (and (bad ?n) (running ?n))"
+        " :effect (and (good ?n) (not (bad ?n))))",
+        attempts=attempts,
+    )
+    async def reset(act, n: str):
+        async def undo() -> None:
+            undone.append(n)
+
+        return undo
+
+    return Repertoire([reset])
+
+
 async def test_what_has_not_helped_is_undone_and_counted(system: hf.ActorSystem) -> None:
     undone: list[str] = []
-
-    def vain(world: World) -> Repertoire:
-        @action(
-            "(:action reset :parameters (?n - node) :precondition (and (bad ?n) (running ?n))"
-            " :effect (and (good ?n) (not (bad ?n))))",
-            attempts=1,
-        )
-        async def reset(act, n: str):
-            async def undo() -> None:
-                undone.append(n)
-
-            return undo
-
-        return Repertoire([reset])
-
-    here = await scene(system, Policy(**QUICK), actions=vain)
+    here = await scene(system, Policy(**QUICK), actions=lambda world: vain(undone, attempts=1))
     await here.change(lambda world: world.hung.add("hm"))
     await here.hear(GaveUp)
     assert [str(one.step) for one in here.all(Undone)] == ["reset(hm)"]
     assert undone == ["hm"]
+    assert (await here.repairer.ask(GetRepairStatus())).useless == 1
+
+
+async def test_what_has_not_helped_is_not_what_the_symptoms_went_by(system: hf.ActorSystem) -> None:
+    here = await scene(system, Policy(approval=600.0, **QUICK), stance="ask", actions=lambda world: vain([], 3))
+    await here.change(lambda world: world.hung.add("hm"))
+    await here.repairer.ask(Approve((await here.hear(ApprovalWanted)).case))
+    await here.hear(ApprovalWanted, 2)
+    await here.change(lambda world: world.hung.discard("hm"))
+    over = await here.hear(Repaired)
+    assert (here.done(), over.actions) == (["reset(hm)"], ())
     assert (await here.repairer.ask(GetRepairStatus())).useless == 1
 
 

@@ -17,12 +17,47 @@ KILLS = "tests/checkpoint/test_kill_counts.py"
 HUNG = "tests/diagnosis/repair/test_hung_turns.py"
 
 CHECKS = {
+    "who hears nothing is killed": Check(
+        "diagnosis/repair/stock.py",
+        "blames_turn=True, at_once=is_silent)",
+        "blames_turn=True)",
+        HUNG,
+        "hears_nothing and recorded",
+    ),
+    "nobody is asked about what is well": Check(
+        "diagnosis/repair/repairer.py",
+        "is_wanted = chosen == bad or (chosen is None and not is_gone)",
+        "is_wanted = chosen in (None, bad)",
+        LOOP,
+        "got_well_before_anybody_answered",
+    ),
+    "what has not helped has no credit": Check(
+        "diagnosis/repair/repairer.py",
+        "        case.note_useless(steps)\n",
+        "",
+        LOOP,
+        "is_not_what_the_symptoms_went_by",
+    ),
     "a turn that rests does not hang": Check(
         "diagnosis/observers/node_observer.py",
         "            self._rested[cell.path] = self.now\n",
         "            pass\n",
         HUNG,
         "rests_as_it_has_said and wait and task",
+    ),
+    "who hangs in an end that nobody has ordered is left to nobody": Check(
+        "supervision/arbiter.py",
+        " and not _hangs_in_its_end(child, cell):",
+        ":",
+        HUNG,
+        "ends_by_itself",
+    ),
+    "an end may take as long as its supervisor gives it": Check(
+        "supervision/arbiter.py",
+        "return cell.node.loop.time() - turn.since > child.spec.shutdown",
+        "return True",
+        HUNG,
+        "ends_by_itself",
     ),
     "that a recorded turn in a process rests is known": Check(
         "diagnosis/observers/node_observer.py",

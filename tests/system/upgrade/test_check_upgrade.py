@@ -237,3 +237,17 @@ def test_a_store_that_cannot_be_read_is_refused_in_words(tmp_path: Path, monkeyp
         status, _, errors = check(monkeypatch, tmp_path / name, code)
         assert status == 2
         assert errors.startswith(f"holdfast check-upgrade: store {tmp_path / name} ")
+
+
+def test_the_children_of_whom_their_supervisor_was_given_another_template_are_checked_by_that(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, store = "from tests.supervision import changes_player; changes_player.main()", tmp_path / "app.db"
+    given = [f"sqlite:{store}", "template", "template, orders", "process"]
+    old = subprocess.run([sys.executable, "-c", run, *given], env=environment(tmp_path), timeout=60.0)
+    assert old.returncode == -9
+    ended, found, _ = check(monkeypatch, store, tmp_path, spec="tests.supervision.changes_player:of_template")
+    assert {address: one["verdict"] for address, one in found.items()} == {
+        f"/app/{name}": "fine" for name in ("team/one", "team/two", "team/three", "others/guest")
+    }
+    assert ended == 0

@@ -58,6 +58,7 @@ class Kill(hf.Message[int]):
     """Kill another actor; how its own process sees to it that one may is taken out first."""
 
     path: str
+    in_turn: bool = False  # as an output of the turn, if the actor is recorded
 
 
 class Terminate(hf.Message[int]):
@@ -121,7 +122,10 @@ class Evil(hf.Actor):
     def kill(self, message: Kill) -> int:
         self._unbridle()
         victim = self.ctx.find(message.path, hf.Actor)
-        self.ctx._cell.node.loop.call_later(0.05, victim.kill)  # Behind our answer.
+        if message.in_turn:
+            victim.kill()
+        else:
+            self.ctx._cell.node.loop.call_later(0.05, victim._cell.obey, "kill", self.ctx.path)  # Behind our answer.
         return 1
 
     @hf.on(Terminate)

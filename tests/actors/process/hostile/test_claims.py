@@ -124,6 +124,18 @@ async def test_it_may_not_send_an_order_by_a_binding_that_it_claims(town: Town, 
     await town.refused(evil, Terminate())
 
 
+async def test_an_order_among_the_outputs_of_a_turn_needs_a_binding_as_well(town: Town) -> None:
+    spec = hf.child("evil", hf.start(Evil), recovery=hf.hybrid(), isolation="process")
+    evil = await town.system.start(spec)
+    with town.system.events() as events:
+        evil.tell(Kill(VICTIM, in_turn=True))
+        breach = await next_event(events, hf.events.TrustBreached)
+        assert breach.problem.startswith(f"'kill' to {VICTIM}, which /app/evil has neither started nor is bound to")
+        await town.system.stop(evil)
+        assert await town.victim.ask(Add(), timeout=60) == 1
+        assert hf.events.ActorKilled not in [type(event) for event in events.take()]
+
+
 @pytest.mark.parametrize("protected", [False, True], ids=["recorded", "protected"])
 async def test_what_it_wants_of_another_child_grants_nothing(town: Town, protected: bool) -> None:
     evil = await town.settle("plain")

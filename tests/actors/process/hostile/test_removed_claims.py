@@ -11,6 +11,13 @@ from tests.removing import Check, as_tests
 CLAIMS = "tests/actors/process/hostile/test_claims.py"
 GATE = "actors/process/wire/worker_gate.py"
 CHECKS = {
+    "a recorded actor in a process orders whom it may": Check(
+        "checkpoint/home/life_ports.py",
+        "                    gate.order(out.to, out.verb)\n",
+        "                    pass\n",
+        CLAIMS,
+        "test_an_order_among_the_outputs and asyncio",
+    ),
     "claims grant nothing": Check(
         "actors/kernel/bindings.py",
         "for port, to in more.bindings.items() if port not in more.claimed}",

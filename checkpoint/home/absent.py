@@ -1,0 +1,96 @@
+"""Who of an earlier program does not live again, as far as that is known: recorded actors may still be tied to them.
+
+A supervisor says, when it begins, which children it has or brings back. Whoever else was below it does not come by
+itself, and an id that it makes up from then on is somebody else's. Of an address whose supervisor has not begun, or
+which the program starts by itself, nothing is known; nor of one at which something is recorded, for whoever is started
+there goes on with that.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ...actors.kernel.links import MADE_UP_NAME, is_anew
+from ...actors.persistence import CHILDREN
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection
+
+    from ...actors.kernel.cell import Cell
+    from ..durable_links import DurableTies
+    from .homes import Homes
+
+
+class Absent:
+    """What the supervisors of one program have said of their children, and ties that wait for somebody to come."""
+
+    def __init__(self, homes: Homes) -> None:
+        self._homes = homes
+        self._listed: dict[str, frozenset[str]] = {}
+        self._waiting: dict[str, dict[DurableTies, None]] = {}
+
+    def began(self, supervisor: str, listed: Collection[str]) -> None:
+        """A supervisor begins with these children; who waits for another one below it hears that it does not come."""
+        if supervisor == self._top:
+            return  # Whatever the program starts is below this one.
+        self._listed[supervisor] = frozenset(listed)
+        for path in [one for one in self._waiting if one.startswith(f"{supervisor}/") and self.is_gone(one)]:
+            for ties in self._waiting.pop(path):
+                ties.end(path)
+
+    @property
+    def _top(self) -> str:
+        return f"/{self._homes.node.name}"
+
+    def is_gone(self, path: str) -> bool:
+        """Whether nobody lives at an address, and whoever has will not live there again."""
+        top, find = self._top, self._homes.node.find
+        if not path.startswith(f"{top}/"):
+            return False
+        above, names = top, path[len(top) + 1 :].split("/")
+        for index, name in enumerate(names):
+            at = f"{above}/{name}"
+            cell = find(at)
+            if cell is None or cell.is_dead:
+                listed = self._listed.get(above)
+                if listed is None:
+                    return any(one.startswith(MADE_UP_NAME) for one in names[index:])
+                return name not in listed and not self._may_return(at)
+            above = at
+        return False
+
+    def _may_return(self, path: str) -> bool:
+        """Whether something is recorded there for whoever comes; not if its supervisor has noted that nobody will."""
+        noted = self._homes.noted(f"{CHILDREN}{path}")
+        return bool(noted) or (noted is None and self._homes.has_recorded(path))
+
+    def is_another(self, cell: Cell) -> bool:
+        """Whether a living actor has its address by an id that was made up since its supervisor has begun."""
+        one: Cell | None = cell
+        while one is not None:
+            above = one.parent
+            if is_anew(one) and (above is None or one.name not in self._listed.get(above.path, ())):
+                return True
+            one = above
+        return False
+
+    def wait(self, path: str, ties: DurableTies) -> None:
+        """Ties to an address where nobody lives wait for somebody to come, or for the word that nobody will."""
+        self._waiting.setdefault(path, {})[ties] = None
+
+    def over(self, path: str, ties: DurableTies) -> None:
+        """They wait no more."""
+        waiting = self._waiting.get(path, {})
+        waiting.pop(ties, None)
+        if not waiting:
+            self._waiting.pop(path, None)
+
+    def dismissed(self, path: str) -> None:
+        """A supervisor is gone: what it has said of its children counts no more."""
+        for one in [one for one in self._listed if one == path or one.startswith(f"{path}/")]:
+            del self._listed[one]
+
+    def rename(self, now: Callable[[str], str]) -> None:
+        """Some actors have moved: `now` gives their addresses."""
+        self._listed = {now(path): listed for path, listed in self._listed.items()}
+        self._waiting = {now(path): waiting for path, waiting in self._waiting.items()}
