@@ -90,8 +90,12 @@ class _JumpingSelector(selectors.DefaultSelector):
         self.most_ticks, self._most_jumps = ticks, jumps
         self._loop = loop
         self._threads = NewThreads()
+        self.end: BaseException | None = None
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        if self.end is not None:
+            end, self.end = self.end, None
+            raise end
         is_busy = timeout is not None and timeout <= 0
         if is_busy and len(self.get_map()) == WAKE_UP_SOCKETS and not self._loop.hears_at_once():
             self._tick()
@@ -205,6 +209,10 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         self._virtual.jumps = 0
         self.forget_ticks()
         super().run_forever()
+
+    def end_by(self, error: BaseException | None) -> None:
+        """Raise an error where the loop would look at its files the next time; None: raise none any more."""
+        self._virtual.end = error
 
     async def rest(self) -> None:
         """Let everything that is due have a turn."""

@@ -265,6 +265,8 @@ class Guard:
                 problems += system.problems()
             self._leaks.forget(self._asks())  # What the end has refused was never waited for.
             problems += [*unseen, *await self._leaks.told(), *self._leaks.outside()]
+            if self._sees_exceptions():  # Now: the threads have had their time.
+                problems += self._leaks.lost_in_threads()
         finally:
             self._leaks.close()
         if problems:
@@ -273,7 +275,10 @@ class Guard:
     def _unseen(self) -> list[str]:
         """Before the systems end: what is asked and queued then was never waited for."""
         found = self._leaks.unseen(self._asks())
-        return found if self._exceptions and not any(one.are_exceptions_expected for one in self._systems) else []
+        return found if self._sees_exceptions() else []
+
+    def _sees_exceptions(self) -> bool:
+        return self._exceptions and not any(one.are_exceptions_expected for one in self._systems)
 
     def _asks(self) -> dict[asyncio.Future[Any], tuple[str, object]]:
         return {future: asked for system in self._systems for future, asked in system.asks.items()}

@@ -268,11 +268,23 @@ def pytest_fixture_setup(
     if makers is None:
         return (yield)
     put: Any = fixturedef  # as pytest-asyncio does, which exchanges the function, too
-    put.func = _of_test(makers[_loop_scope_of(request)], request.node)
+    try:
+        put.func = _of_test(makers[_loop_scope_of(request)], request.node)
+    except pytest.fail.Exception as refused:
+        put.func = _raising(refused)  # Where the fixture is made: pytest has to see that it was begun.
     try:
         return (yield)
     finally:
         put.func = function
+
+
+def _raising(error: BaseException) -> Callable[..., None]:
+    """In place of a fixture that is refused."""
+
+    def refused(**given: object) -> None:
+        raise error
+
+    return refused
 
 
 def _of_test(maker: Any, item: pytest.Item) -> Any:

@@ -40,6 +40,7 @@ from .guard.loop_leaks import LoopLeaks
 from .guard.loop_methods import LoopMethods
 from .guarded import GuardedSystem, UnexpectedEnd
 from .library_code import is_file_of_library
+from .schedules.bound_names import BoundNames, names_of
 from .schedules.charts import Recorder
 from .schedules.charts import as_html as chart_as_html
 from .schedules.charts import as_text as chart_as_text
@@ -58,11 +59,23 @@ from .schedules.choices import (
 )
 from .schedules.control import Control, ControlledLoop
 from .schedules.disk import PATH, Latency, NoRootToKill, SimulatedDisk
+from .schedules.hash_seeds import (
+    RANDOM,
+    PassesElsewhere,
+    before_command,
+    hash_seed_in_words,
+    here,
+    parted,
+    passes_elsewhere,
+    require_hash_seed,
+    with_hash_seed,
+)
 from .schedules.places import Root, inside
 from .schedules.processes import SimulatedWorkers
 from .schedules.shrinking import shrink
 from .schedules.strategies import DEPTH, mixed
 from .schedules.strategies import strategy as strategy_of
+from .schedules.time_limits import TimeLimit, is_of_time_limit
 from .schedules.turn_log import TurnLog
 from .schedules.world import World
 from .swaps import Swaps
@@ -122,10 +135,10 @@ class Simulation:
         self._ends: list[Callable[[], None]] = []
         self._surroundings = contextlib.ExitStack()
 
-    def enter(self, loop: asyncio.AbstractEventLoop) -> None:
-        """From here to `remove` the world is the seed's."""
+    def enter(self, loop: asyncio.AbstractEventLoop, names: BoundNames) -> None:
+        """From here to `remove` the world is the seed's, also what a program has of it by these names."""
         assert isinstance(loop, ControlledLoop)
-        self.world = self._surroundings.enter_context(World(self.seed, loop))
+        self.world = self._surroundings.enter_context(World(self.seed, loop, names))
 
     @property
     def escaped(self) -> tuple[str, ...]:
@@ -183,6 +196,12 @@ class Simulation:
         elif self.world is not None:
             root.system.read_along(self.world.look_for_addresses)
         return root
+
+    def told_of_its_end(self) -> None:
+        """The test has heard that its time is over, if it is: what follows may go on to the end of its system."""
+        loop = asyncio.get_running_loop()
+        if isinstance(loop, ControlledLoop):
+            loop.end_by(None)
 
     async def end(self, kind: Any = None, error: Any = None, trace: Any = None) -> None:
         """End the system that lives."""
@@ -281,7 +300,7 @@ class RealRun(Simulation):
 
     is_real = True
 
-    def enter(self, loop: asyncio.AbstractEventLoop) -> None:
+    def enter(self, loop: asyncio.AbstractEventLoop, names: BoundNames) -> None:
         """The world stays as it is."""
 
     async def begin(
@@ -374,7 +393,7 @@ class SimulationSettings:
         _seconds("latency", self.latency)
         _seconds("sync", self.sync)
         if self.replay is not None:
-            from_text(self.replay)
+            from_text(parted(self.replay)[0])
 
     def said(self, wanted: SystemsWanted, seeds: int | None = None) -> range | str:
         """The seeds to try, or the schedule to repeat. The command line and the environment have the last word."""
@@ -513,16 +532,41 @@ class ScheduleSearch:
         """
         said = self._settings.said(self._wanted)
         if isinstance(said, str):
-            number, taken = from_text(said)
-            simulation = self._try(repeated(number, taken))
+            schedule, found = parted(said)
+            require_hash_seed(said, self._command())
+            simulation = self._try(repeated(*from_text(schedule)))
             self._forget(said)
-            require_fit(said, simulation.choices)
+            require_fit(schedule, simulation.choices)
+            if found == RANDOM:
+                warnings.warn(passes_elsewhere(said), PassesElsewhere, stacklevel=3)
             return
-        if self._settings.seed is None and self._failures is not None and len(said) > 1:
-            for text in self._failures.texts():
-                number, taken = from_text(text)
-                self._try(repeated(number, taken))
+        passed = self._try_kept() if self._settings.seed is None and len(said) > 1 else []
+        self._search(said)
+        for told in passed:  # Now: where a warning is an error, the seeds have been tried all the same.
+            warnings.warn(told, PassesElsewhere, stacklevel=3)
+
+    def _try_kept(self) -> list[str]:
+        """Try what has failed before. Returns what is to be told of schedules that pass only now, or only here."""
+        told: list[str] = []
+        if self._failures is None:
+            return told
+        for text in self._failures.texts():
+            schedule, found = parted(text)
+            self._try(repeated(*from_text(schedule)))
+            if found in (None, RANDOM, here()):
                 self._failures.drop(text)
+            if found == RANDOM or found not in (None, here()):
+                told.append(passes_elsewhere(text, self._command()))
+        return told
+
+    def _command(self) -> str:
+        """What runs this test again, as it was run."""
+        file = self._wanted.option("replay")
+        option = f"--holdfast-replay {file} " if file else ""
+        return f"pytest {option}'{self._wanted.nodeid}'" if self._wanted.nodeid else "the program again"
+
+    def _search(self, said: range) -> None:
+        """Try one seed after the other."""
         for number in said:
             if self._named == "pct" and len(said) == 1 and number:
                 self._learn(self._run(strategy_of("pct").choices(0) or Choices(0)))
@@ -569,10 +613,21 @@ class ScheduleSearch:
         try:
             return self._run(choices, looks=looks)
         except BaseException as error:
+            if is_of_time_limit(error):
+                error.add_note(
+                    f"its time was over in the run of seed {choices.seed}, which is neither made again nor shrunk"
+                )
             if not _is_failure(error):
                 raise
             failure = error
-        raise self._explained(failure)
+        try:
+            explained = self._explained(failure)
+        except BaseException as error:
+            if not is_of_time_limit(error):
+                raise
+            failure.add_note(f"the time of the test was over before this failure, of seed {choices.seed}, was shrunk")
+            explained = failure
+        raise explained
 
     def _explained(self, failure: BaseException) -> BaseException:
         """The failure of the shortest schedule that shows it, with a note; or that it cannot be repeated."""
@@ -599,7 +654,7 @@ class ScheduleSearch:
                     raise
                 again = error.__simulation__  # type: ignore[attr-defined]
             difference = _difference(first, again) or f"the run of seed {seed} fails only sometimes"
-            note = f"{_head(seed, None, self._is_of_seed())}\n{difference}"
+            note = "\n".join([_head(seed, None, self._is_of_seed()), *hash_seed_in_words(), str(difference)])
             for line in (note, *self._record(failure, as_text(seed, taken), recorder, note)):
                 failure.add_note(line)
             return failure
@@ -635,7 +690,7 @@ class ScheduleSearch:
 
     def _note(self, failure: BaseException, simulation: Simulation, taken: Taken, recorder: Recorder) -> str:
         seed, text = simulation.seed, as_text(simulation.seed, taken)
-        lines = [_head(seed, text, self._is_of_seed())]
+        lines = [_head(seed, text, self._is_of_seed()), *hash_seed_in_words()]
         count = size(taken)
         lines.append(
             f"shrunk to {count} choice{'' if count == 1 else 's'} other than production's order"
@@ -648,7 +703,7 @@ class ScheduleSearch:
         if chart:
             lines.append(chart)
         if self._failures is not None:
-            self._failures.add(text)
+            self._failures.add(with_hash_seed(text))
         return "\n".join([*lines, *self._record(failure, text, recorder, "\n".join(lines))])
 
     def _record(self, failure: BaseException, text: str, recorder: Recorder, note: str) -> list[str]:
@@ -692,9 +747,12 @@ def _written(folder: Path, failure: BaseException, text: str, recorder: Recorder
     ]
     (folder / "failure.txt").write_text("\n".join(said) + "\n", encoding="utf-8")
     schedule, chart = folder / "schedule.txt", folder / "chart.html"
-    schedule.write_text(text + "\n", encoding="utf-8")
+    schedule.write_text(with_hash_seed(text) + "\n", encoding="utf-8")
     chart.write_text(chart_as_html(recorder.rows, nodeid, note), encoding="utf-8")
-    return [f"all of it as a chart: {chart}", f"repeat it: pytest --holdfast-replay {schedule} '{nodeid}'"]
+    return [
+        f"all of it as a chart: {chart}",
+        f"repeat it: {before_command()}pytest --holdfast-replay {schedule} '{nodeid}'",
+    ]
 
 
 def _head(seed: int, text: str | None, is_of_seed: bool) -> str:
@@ -708,7 +766,7 @@ def _is_failure(error: BaseException) -> bool:
     """Whether it is the outcome of a run, and not the wish to end the test."""
     pytest = sys.modules.get("pytest")
     failed = (Exception,) if pytest is None else (Exception, pytest.fail.Exception)
-    return isinstance(error, failed) and hasattr(error, "__simulation__")
+    return isinstance(error, failed) and hasattr(error, "__simulation__") and not is_of_time_limit(error)
 
 
 def _kind(error: BaseException) -> tuple[object, ...]:
@@ -788,7 +846,10 @@ def run_schedule(
     simulation = Simulation(choices, latency, sync)
     try:
         with asyncio.Runner(loop_factory=functools.partial(ControlledLoop, ticks=ticks)) as runner:
-            runner.run(_run(test, simulation, own, options, recorder, looks))
+            loop = runner.get_loop()
+            assert isinstance(loop, ControlledLoop)
+            with TimeLimit(loop):
+                runner.run(_run(test, simulation, own, options, recorder, looks))
     except BaseException as error:
         error.__simulation__ = simulation  # type: ignore[attr-defined]
         raise
@@ -803,7 +864,7 @@ def run_real(test: Test, own: set[str], options: dict[str, Any], seeds: range | 
     Raises:
         whatever the test raises, with a note.
     """
-    for seed in (from_text(seeds)[0],) if isinstance(seeds, str) else seeds:
+    for seed in (from_text(parted(seeds)[0])[0],) if isinstance(seeds, str) else seeds:
         simulation = RealRun(Choices(seed))
         try:
             with asyncio.Runner() as runner:
@@ -821,7 +882,7 @@ async def _run(
     wanted, faults = running.get(), simulation.faults
     leaks, unseen = LoopLeaks(wanted.leaks), list[str]()
     options = {"seed": simulation.seed, **wanted.options, **options}
-    simulation.enter(asyncio.get_running_loop())
+    simulation.enter(asyncio.get_running_loop(), names_of(test))
     try:
         try:
             system = await simulation.begin(options, recorder, looks=looks)
@@ -836,6 +897,7 @@ async def _run(
                     simulation.stop_recording()
                     simulation.choices.end()
             except BaseException:
+                simulation.told_of_its_end()
                 await simulation.end(*sys.exc_info())
                 raise
             await simulation.end()

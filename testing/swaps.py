@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import ctypes
 import gc
-from types import TracebackType
+from collections.abc import Iterable
+from types import ModuleType, TracebackType
 from typing import Any, ClassVar, Final
 
 SEALED: Final = 1 << 8
@@ -69,6 +70,18 @@ class Swaps:
         write(owner, name, value)
         self._made.append(swap)
         self._standing.setdefault((id(owner), name), []).append(swap)
+
+    def follow(self, names: Iterable[tuple[ModuleType, str]]) -> None:
+        """Exchange functions also where modules have imported them by name."""
+        new = {
+            id(swap.old): swap.value
+            for swap in self._made
+            if isinstance(swap.owner, ModuleType) and callable(swap.old) and callable(swap.value)
+        }
+        for module, name in names:
+            value = new.get(id(vars(module).get(name)))
+            if value is not None:
+                self.put(module, name, value)
 
     def undo(self) -> None:
         """Put everything back; a second call changes nothing."""

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from .guarded import GuardedSystem
     from .schedules.failures import Failures
 
-LEAKS = frozenset({"descriptors", "processes", "tasks", "threads", "timers"})
+LEAKS = frozenset({"descriptors", "generators", "processes", "signals", "tasks", "threads", "timers"})
 """What a test can leave behind."""
 
 

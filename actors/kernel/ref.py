@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Generic, Literal, TypeAlias
 from typing_extensions import TypeVar
 
 from ..errors import ActorRestarting, HoldfastError, SpecError
-from ..values.saved_refs import Addressed
+from ..values.saved_refs import Addressed, hash_of_address
 from .envelope import NO_DEADLINE, Ask, in_next_pass
 from .message import Message
 
@@ -40,10 +40,11 @@ class ActorRef(Addressed, Generic[A_co]):
     What it sends takes one path: the address's `admit` (mailbox.py), its queue, and a turn (loop.py).
     """
 
-    __slots__ = ("_cell",)
+    __slots__ = ("_cell", "_hash")
 
     def __init__(self, cell: Cell) -> None:
         self._cell = cell
+        self._hash: int | None = None
 
     @property
     def path(self) -> str:
@@ -175,7 +176,10 @@ class ActorRef(Addressed, Generic[A_co]):
         return theirs is self._cell or (theirs.node is self._cell.node and theirs.path == self._cell.path)
 
     def __hash__(self) -> int:
-        return hash(self._cell.path)
+        found = self._hash
+        if found is None:
+            found = self._hash = hash_of_address(self._cell.path)
+        return found
 
 
 def _restarting(cell: Cell, restarting: str, sender: ActorContext | None) -> asyncio.Future[Any] | None:

@@ -2,6 +2,17 @@
 
 from __future__ import annotations
 
+from zlib import crc32
+
+
+def hash_of_address(path: str) -> int:
+    """The hash of what stands for an address: the same in every process, as that of a string is not.
+
+    >>> hash_of_address("/app/bank/alice")
+    1410990431
+    """
+    return crc32(path.encode("utf-8", "surrogatepass"))
+
 
 class Addressed:
     """What stands for the address of an actor: a ref, or what was saved of one."""
@@ -44,4 +55,4 @@ class SavedRef(Addressed):
         return self._path == other._path if isinstance(other, SavedRef) else NotImplemented
 
     def __hash__(self) -> int:
-        return hash(self._path)
+        return hash_of_address(self._path)

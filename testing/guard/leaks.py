@@ -14,6 +14,7 @@ import weakref
 from collections.abc import Callable, Collection
 from typing import Any, ClassVar
 
+from .handlers import handlers
 from .loop_leaks import LoopLeaks
 from .thread_leaks import ThreadLeaks
 
@@ -21,6 +22,7 @@ TOLD = {
     "processes": "process was left running",
     "threads": "thread was left running",
     "descriptors": "descriptor was left open",
+    "signals": "handler of a signal was left",
 }
 OPEN_FILES = "/proc/self/fd"
 FILE: Callable[[os.stat_result], tuple[int, int]] = operator.itemgetter(stat.ST_DEV, stat.ST_INO)
@@ -37,7 +39,7 @@ KEPT = (
 
 
 class Leaks(LoopLeaks):
-    """As LoopLeaks, with child processes, threads and open descriptors."""
+    """As LoopLeaks, with child processes, threads, open descriptors and handlers of signals."""
 
     _with_reserve: ClassVar[weakref.WeakKeyDictionary[Any, int]] = weakref.WeakKeyDictionary()  # as loops outlive tests
 
@@ -47,12 +49,18 @@ class Leaks(LoopLeaks):
         super().__init__(allowed)
         self._threads = ThreadLeaks()
         self._children = pids()
+        self._handlers = handlers()
         self._files = identities(Leaks._likely)
         Leaks._likely = (*self._files,)
 
     def outside(self) -> list[str]:
         """What is left outside of the loop, as problems."""
-        left = {"processes": self.processes, "threads": self.threads, "descriptors": self.files}
+        left = {
+            "processes": self.processes,
+            "threads": self.threads,
+            "descriptors": self.files,
+            "signals": self.signals,
+        }
         return [
             f"a {TOLD[kind]}: {text}" for kind, look in left.items() if kind not in self._allowed for text in look()
         ]
@@ -68,6 +76,18 @@ class Leaks(LoopLeaks):
     def threads(self) -> list[str]:
         """Threads that the test has started, and that do not end."""
         return self._threads.told()
+
+    def signals(self) -> list[str]:
+        """Signals that are handled in another way than before."""
+        now = handlers()
+        return [
+            f"{number.name} calls {now[number]!r}" for number, before in self._handlers.items() if now[number] != before
+        ]
+
+    def lost_in_threads(self) -> list[str]:
+        """Exceptions that have ended threads, as problems."""
+        hint = "catch it, or if it is meant to be: actor_system.expect_exceptions()"
+        return [f"an exception has ended a thread: {text}; {hint}" for text in self._threads.lost]
 
     def files(self) -> list[str]:
         """What is open and was not."""

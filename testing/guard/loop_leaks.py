@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import weakref
 from collections.abc import Collection, Iterable, Mapping
+from types import AsyncGeneratorType
 from typing import TYPE_CHECKING, Any
 
 from ...actors.kernel.ref import current
 from ..library_code import is_module_of_library
 from .loop_methods import LoopMethods
+from .thread_leaks import is_installed
 
 if TYPE_CHECKING:
     from ...actors.kernel.node import Node
@@ -42,8 +45,10 @@ class LoopLeaks:
             self._loop = asyncio.get_running_loop()
         except RuntimeError:
             self._tasks, self._handler = set[asyncio.Task[object]](), None
+            self._generators = set()
             return
         self._tasks = asyncio.all_tasks()
+        self._generators = self._open_generators()
         self._handler = self._loop.get_exception_handler()
         self._methods = LoopMethods.of(type(self._loop))
         self._methods.note(self._loop, self)
@@ -81,7 +86,26 @@ class LoopLeaks:
         return [
             *(f"a task was left running: {text}" for text in tasks if "tasks" not in self._allowed),
             *(f"a timer was left: {text}; cancel its handle" for text in timers),
+            *(f"an async generator was left open: {text}; close it (aclose)" for text in self.generators()),
         ]
+
+    def generators(self) -> list[str]:
+        """Async generators of the test that were begun, and neither ended nor closed."""
+        if "generators" in self._allowed or not self._new_generators():
+            return []
+        gc.collect()  # What only a reference cycle holds is closed by the loop.
+        return [f"{one.__qualname__} at {one.ag_code.co_filename}" for one in self._new_generators()]
+
+    def _new_generators(self) -> list[AsyncGeneratorType[Any, Any]]:
+        left = self._open_generators() - self._generators
+        return [one for one in left if one.ag_frame is not None and not is_installed(one.ag_code.co_filename)]
+
+    def _open_generators(self) -> set[AsyncGeneratorType[Any, Any]]:
+        """Those that the loop knows of; uvloop does not show them."""
+        if not isinstance(self._loop, asyncio.BaseEventLoop):
+            return set()
+        known: Any = self._loop
+        return {*known._asyncgens}
 
     async def tasks(self) -> list[str]:
         """Tasks that are not ours and still run after a few turns of the loop."""

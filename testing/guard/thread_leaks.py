@@ -7,6 +7,7 @@ import site
 import sys
 import sysconfig
 import threading
+from concurrent.futures import thread as pools
 from time import monotonic
 from types import FrameType
 from typing import Any
@@ -17,6 +18,8 @@ from ..threads import Onlooker
 
 GRACE = 2.0
 """Real seconds that a thread which is about to end may take."""
+LOOK_AGAIN = 0.02
+"""Seconds between two looks at a thread of a pool, whose end of work wakes nobody here."""
 LIBRARIES = tuple(
     os.path.join(folder, "")
     for folder in (
@@ -63,30 +66,58 @@ class ThreadLeaks:
         self._started: list[tuple[threading.Thread, str]] = []
         self._notes = ThreadStarts.standing().notes
         self._notes.append(self)
+        self.lost: list[str] = []
+        self._swaps = Swaps()
+        hook = threading.excepthook
+
+        def ended(args: Any) -> None:
+            if args.exc_type is not SystemExit:
+                self.lost.append(f"{args.exc_type.__name__}: {args.exc_value}, in {_name(args.thread)}")
+            hook(args)
+
+        self._swaps.put(threading, "excepthook", ended)
 
     def started(self, thread: threading.Thread, where: str) -> None:
         """A thread is about to start."""
         self._started.append((thread, where))
 
     def told(self) -> list[str]:
-        """The threads that do not end; nothing is noted any more."""
-        self.close()
+        """The threads that do not end, and those of pools that are at work; nothing is noted any more."""
+        if self in self._notes:
+            self._notes.remove(self)
         deadline = monotonic() + GRACE
         for thread, _ in self._started:
-            if thread.is_alive() and thread is not threading.current_thread():
-                thread.join(max(0.0, deadline - monotonic()))
-        return [f"{thread.name}, started at {where}" for thread, where in self._started if thread.is_alive()]
+            while _goes_on(thread) and thread is not threading.current_thread() and monotonic() < deadline:
+                thread.join(LOOK_AGAIN if thread in pools._threads_queues else deadline - monotonic())
+        self._swaps.undo()
+        return [f"{thread.name}, started at {where}" for thread, where in self._started if _goes_on(thread)]
 
     def close(self) -> None:
         """Note nothing any more; a second call changes nothing."""
+        self._swaps.undo()
         if self in self._notes:
             self._notes.remove(self)
 
 
+def _goes_on(thread: threading.Thread) -> bool:
+    """Whether a thread has something to do; that of a pool has nothing while it waits for work."""
+    if not thread.is_alive():
+        return False
+    frame = sys._current_frames().get(thread.ident or 0) if thread in pools._threads_queues else None
+    return frame is None or frame.f_code is not pools._worker.__code__
+
+
+def _name(thread: threading.Thread | None) -> str:
+    return "a thread" if thread is None else thread.name
+
+
 def _starter(frame: FrameType | None) -> FrameType | None:
-    """Where a thread was started, beyond `threading` itself; None: by a library."""
-    while frame is not None and frame.f_globals.get("__name__") in ("threading", __name__):
+    """Where a thread was started, beyond `threading` and its pools; None: by a library."""
+    while frame is not None and frame.f_globals.get("__name__") in ("threading", pools.__name__, __name__):
         frame = frame.f_back
-    if frame is None or frame.f_code.co_filename.startswith(LIBRARIES) or is_file_of_library(frame.f_code.co_filename):
-        return None
-    return frame
+    return None if frame is None or is_installed(frame.f_code.co_filename) else frame
+
+
+def is_installed(file: str) -> bool:
+    """Whether a file of code is a library's, this one's or another's."""
+    return file.startswith(LIBRARIES) or is_file_of_library(file)

@@ -33,6 +33,7 @@ from ..guard.loop_leaks import LoopLeaks
 from ..guarded import GuardedSystem, UnexpectedEnd
 from ..histories.checker import linearizable
 from ..histories.history import History, Model
+from ..schedules.bound_names import names_of
 from ..schedules.charts import Recorder
 from ..schedules.charts import as_text as chart_as_text
 from ..schedules.choices import ROUNDS, Choices, Production, as_text, from_text, repeated, require_fit
@@ -98,7 +99,7 @@ class ActorMachine(RuleBasedStateMachine):
         loop = self._runner.get_loop()
         assert isinstance(loop, ControlledLoop)
         self._loop = loop
-        self._world = self._simulation.world = World(choices.seed, loop)
+        self._world = self._simulation.world = World(choices.seed, loop, names_of(type(self)))
         self._leaks: LoopLeaks
         self.run(self._begin())
         try:

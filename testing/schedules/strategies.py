@@ -33,6 +33,9 @@ FAIR: Final = 200
 """Choices in a row after which PCT puts whoever has had them behind all others: it may wait for one of them."""
 CHANGES: Final = 8
 """At most so many choices are changed in a schedule that `coverage` builds on."""
+FRESH: Final = 0.2
+OTHERS: Final = 0.2
+"""How likely `coverage` takes a run that builds on nothing, or builds on a mere new order of who came when."""
 
 Trace = Sequence[tuple[str, str]]
 
@@ -144,17 +147,23 @@ class Pct:
 
 
 class CoverageGuided:
-    """Changes at random what has brought something new: two messages next to each other at an actor in a new order."""
+    """Changes at random what has brought something new: two messages next to each other at an actor in a new order.
+
+    Who came when is something new, too, but hardly a run is without: what has brought only that is taken less often.
+    """
 
     def __init__(self) -> None:
         self._seen: set[tuple[str, str, str]] = set()
+        self._orders: set[tuple[str, ...]] = set()
         self._corpus: list[Taken] = []
+        self._others: list[Taken] = []
 
     def choices(self, seed: int) -> Choices | None:
         draw = random.Random(f"coverage {seed}")
-        if not self._corpus or draw.random() < 0.3:
+        if not self._corpus or draw.random() < FRESH:
             return mixed(seed)
-        return Changed(seed, draw, self._corpus[-1 - int(len(self._corpus) * draw.random() ** 2)])
+        taken = self._others if self._others and draw.random() < OTHERS else self._corpus
+        return Changed(seed, draw, taken[-1 - int(len(taken) * draw.random() ** 4)])
 
     def learn(self, choices: Choices, trace: Trace) -> None:
         last: dict[str, str] = {}
@@ -165,11 +174,12 @@ class CoverageGuided:
             if pair not in self._seen:
                 self._seen.add(pair)
                 new = True
-        order = tuple(path for path, _ in trace[-64:])  # Who came when is something new, too.
-        pair = ("", "", str(hash(order)))
-        if new or pair not in self._seen:
-            self._seen.add(pair)
+        order = tuple(path for path, _ in trace[-64:])
+        if new:
             self._corpus.append(choices.kept())
+        elif order not in self._orders:
+            self._others.append(choices.kept())
+        self._orders.add(order)
 
 
 class Changed(Replay):
@@ -180,8 +190,10 @@ class Changed(Replay):
         self._draw = draw
         steps = sorted(taken.get(TURN, {})) or [1]
         last = steps[-1] + 4
-        self._anew = {draw.randint(1, last) for _ in range(draw.randint(1, CHANGES))}
-        self._until = draw.choice(steps) if draw.random() < 0.5 else last
+        if draw.random() < 0.5:  # another end, and more often a short one: what was new came late
+            self._anew, self._until = set[int](), steps[-1 - int(len(steps) * draw.random() ** 2)]
+        else:
+            self._anew, self._until = {draw.randint(1, last) for _ in range(draw.randint(1, CHANGES))}, last
 
     def choose(self, count: int, keys: Keys) -> int:
         if self.steps in self._anew or self.steps > self._until:

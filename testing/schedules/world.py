@@ -29,6 +29,7 @@ from anyio._backends._asyncio import CancelScope, WorkerThread
 from ..library_code import is_file_of_library
 from ..swaps import Swaps
 from ..threads import Onlooker
+from .bound_names import BoundNames, OwnStates
 from .numbered import as_completed, numbering, scope_in_order
 from .shown_addresses import shown_address
 
@@ -50,11 +51,15 @@ class World:
 
     The context can be entered again: the run goes on with the random numbers that come next.
 
+    Args:
+        names: by which the program has the same functions, and its own generators.
+
     Attributes:
         escaped: what the run has used that is not the seed's, each once.
     """
 
-    def __init__(self, seed: int, loop: ControlledLoop) -> None:
+    def __init__(self, seed: int, loop: ControlledLoop, names: BoundNames) -> None:
+        self._names, self._generators = names, OwnStates(names.generators, seed)
         self.escaped: dict[str, None] = {}
         self._seed, self._loop = seed, loop
         self._swaps = Swaps()
@@ -118,6 +123,8 @@ class World:
         self._tell_of(subprocess.Popen, "__init__", "a process was started", "what it does")
         for name in ("fork", "forkpty", "posix_spawn", "posix_spawnp", "system"):
             self._tell_of(os, name, f"a process was started (os.{name})", "what it does")
+        self._swaps.follow(self._names.functions)
+        self._generators.put()
         return self
 
     def _put_numpy(self) -> None:
@@ -177,6 +184,7 @@ class World:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self._generators.take_back()
         self._own_state = random.getstate()
         self._swaps.undo()
         random.setstate(self._state)

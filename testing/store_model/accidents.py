@@ -18,7 +18,7 @@ from .comparing import PromiseBroken, refused
 from .contents import check_twice
 from .model import StoreModel, settle
 from .samples import make_small_blocks
-from .watching import FileFault, is_sync, is_write, watched
+from .watching import FileFault, is_renaming, is_sync, is_write, watched
 from .writes import A, B, Write, all_writes, append, cut, do_failing, do_killed, erase, fill, note
 
 MOST: Final = 40
@@ -171,13 +171,13 @@ def after_a_failed_sync_everything_is_refused(bench: Bench) -> None:
 
 
 def what_was_written_is_synced(bench: Bench) -> None:
-    """Where Python code writes the files, Python code syncs one of them before `sync` returns."""
+    """Where Python code writes the files, it syncs one of them before `sync` returns, and one after it gave a name."""
     opened = bench.open()
     seen: list[str] = []
 
     def look(event: str, call: Any) -> None:
-        if event == "c_return" and (is_write(call) or is_sync(call)):
-            seen.append("sync" if is_sync(call) else "write")
+        if event == "c_return" and (is_write(call) or is_sync(call) or is_renaming(call)):
+            seen.append("sync" if is_sync(call) else "name" if is_renaming(call) else "write")
 
     for number in range(3):
         seen.clear()
@@ -187,6 +187,10 @@ def what_was_written_is_synced(bench: Bench) -> None:
         if "write" in seen and "sync" not in seen:
             raise PromiseBroken(
                 "append wrote to a file, and sync returned without fsync or fdatasync: nothing is synced"
+            )
+        if "name" in seen and "sync" not in seen[-seen[::-1].index("name") - 1 :]:
+            raise PromiseBroken(
+                "a file was given its name, and sync returned with nothing synced since: a power failure takes the name"
             )
 
 

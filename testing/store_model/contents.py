@@ -23,6 +23,8 @@ MANY_ENTRIES: Final = 1500
 """Entries of a large batch."""
 MANY_ADDRESSES: Final = 2000
 MANY_NOTES: Final = 300
+MANY_PACKS: Final = 70
+MANY_OPENINGS: Final = 20
 
 
 def check_twice(opened: OpenEngine, model: StoreModel, **more: Sequence[str]) -> None:
@@ -181,6 +183,11 @@ def _as_range(positions: list[int]) -> range:
     return range(positions[0], positions[-1] + 1)
 
 
+def _as_range_with_a_step(positions: list[int]) -> range:
+    """The first of them, the third, and so on."""
+    return range(positions[0], positions[-1] + 1, 2 * (positions[1] - positions[0]))
+
+
 def _as_array(positions: list[int]) -> Sequence[int]:
     return array.array("q", positions)
 
@@ -197,6 +204,7 @@ FORMS: Final[tuple[Callable[[list[int]], Sequence[int]], ...]] = (
     list,
     tuple,
     _as_range,
+    _as_range_with_a_step,
     _as_array,
     _doubled,
     _with_others,
@@ -340,6 +348,25 @@ def packs_that_are_not_needed_are_forgotten_and_no_others(bench: Bench) -> None:
     check_twice(opened, model)
 
 
+def many_packs_are_forgotten_at_once(bench: Bench) -> None:
+    """All but the newest, as after a snapshot that begins anew."""
+    opened, model = bench.open(), StoreModel()
+    for number in range(MANY_PACKS):
+        keep_blocks(opened.journal, model, A, number, [(0, memoryview(b"%d" % number))])
+    cut(opened.journal, model, A, b"of the newest", [], turn=1)
+    forget_blocks(opened.journal, model, A, range(MANY_PACKS - 1))
+    check_twice(opened, model)
+
+
+def epochs_rise_over_many_openings(bench: Bench) -> None:
+    """Whoever has come to a store has a higher one than all before."""
+    opened, model = bench.open(), StoreModel()
+    append(opened.journal, model, (A, ("in", 1)))
+    for _ in range(MANY_OPENINGS):
+        opened.reopen()
+    model.check(opened.journal)
+
+
 # ---- erasing, addresses, and hygiene
 
 
@@ -455,6 +482,8 @@ CONTENTS: Final = (
 BOUNDS: Final = (
     large_values_are_kept,
     many_notes_are_kept,
+    many_packs_are_forgotten_at_once,
+    epochs_rise_over_many_openings,
     thousands_of_addresses_are_kept,
     large_batches_are_kept_whole,
 )

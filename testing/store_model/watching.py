@@ -24,6 +24,7 @@ _WRITES: Final = frozenset(
 _NAMES: Final = frozenset(
     getattr(os, name) for name in ("open", "rename", "replace", "link", "unlink", "remove", "mkdir", "rmdir")
 )
+_RENAMES: Final = frozenset((os.rename, os.replace, os.link))
 _SYNCS: Final = frozenset(getattr(os, name) for name in ("fsync", "fdatasync", "sync") if hasattr(os, name))
 _METHODS: Final = frozenset(("write", "writelines", "truncate", "flush"))
 _HARMLESS: Final = (list, dict, set, frozenset, tuple, str, bytes, bytearray, int, type, memoryview)
@@ -40,6 +41,11 @@ def is_write(call: Any) -> bool:
 def is_sync(call: Any) -> bool:
     """Whether it brings a file to the disk."""
     return call in _SYNCS
+
+
+def is_renaming(call: Any) -> bool:
+    """Whether it gives a file another name."""
+    return call in _RENAMES
 
 
 def touches_files(call: Any) -> bool:

@@ -159,18 +159,22 @@ LEAKS = {
     ),
     "timers": ("asyncio.get_running_loop().call_later(100, print)", "a timer was left: builtins.print, due in *"),
     "tasks": ("kept.append(asyncio.ensure_future(asyncio.sleep(3600)))", "a task was left running: *sleep*"),
+    "signals": (
+        "signal.signal(signal.SIGUSR1, lambda *_: None)",
+        "a handler of a signal was left: SIGUSR1 calls <function *",
+    ),
 }
 
 
 @pytest.mark.parametrize("loops", ["asyncio", "uvloop"])
 @pytest.mark.parametrize("kind", LEAKS)
 def test_each_leak_is_found_and_can_be_allowed(suite, kind: str, loops: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("holdfast.testing.guard.thread_leaks.GRACE", 0.01)
+    monkeypatch.setattr("holdfast.testing.guard.thread_leaks.GRACE", 0.3)
     leak, text = LEAKS[kind]
     allowed = ("timers", "tasks") if kind == "tasks" else (kind,)
     result = suite(
         f"""
-import threading
+import signal, threading
 kept, gate = [], threading.Event()
 
 async def test_leaks(actor_system):
@@ -187,10 +191,13 @@ async def test_cleans_up(actor_system):
     asyncio.get_running_loop().call_later(100, print).cancel()
     await asyncio.to_thread(int)
     open("/dev/null").close()
+    before = signal.signal(signal.SIGUSR2, print)
+    signal.signal(signal.SIGUSR2, before)
     await task
 
 def test_end():
     gate.set()
+    signal.signal(signal.SIGUSR1, signal.SIG_DFL)
     for one in kept:
         if hasattr(one, "close"): one.close()
 """,
@@ -200,12 +207,122 @@ def test_end():
     result.stdout.fnmatch_lines([f"*{text}*"])
 
 
+def test_a_pool_that_the_test_has_made_is_told_if_it_is_at_work(suite, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("holdfast.testing.guard.thread_leaks.GRACE", 0.2)
+    result = suite("""
+import threading
+from concurrent.futures import ThreadPoolExecutor
+gate, pools = threading.Event(), []
+
+async def test_leaves_it_at_work(actor_system):
+    pools.append(ThreadPoolExecutor(1, "mine"))
+    pools[-1].submit(gate.wait)
+
+async def test_leaves_it_idle(actor_system):
+    pools.append(ThreadPoolExecutor(1))
+    assert await asyncio.wrap_future(pools[-1].submit(int)) == 0
+
+async def test_leaves_it_with_what_ends(actor_system):
+    pools.append(ThreadPoolExecutor(1))
+    pools[-1].submit(gate.wait, 0.05)
+
+async def test_has_the_loop_wait_for_it(actor_system):
+    task = asyncio.ensure_future(asyncio.to_thread(gate.wait))
+    await asyncio.sleep(0)
+    gate.set()
+    await task
+
+def test_end():
+    for pool in pools:
+        pool.shutdown()
+""")
+    result.assert_outcomes(passed=5, errors=1)
+    result.stdout.fnmatch_lines(["*a thread was left running: mine_0, started at *test_*.py:*"])
+
+
+def test_an_exception_that_ends_a_thread_is_told(suite) -> None:
+    result = suite("""
+import threading
+pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+
+def fails():
+    raise LookupError("in a thread")
+
+def run(target):
+    thread = threading.Thread(target=target, name="mine")
+    thread.start()
+    thread.join()
+
+async def test_fails(actor_system):
+    run(fails)
+
+async def test_says_so(actor_system):
+    actor_system.expect_exceptions()
+    run(fails)
+
+@pytest.mark.holdfast(exceptions=True)
+async def test_is_marked(actor_system):
+    run(fails)
+
+async def test_exits(actor_system):
+    run(exit)
+""")
+    result.assert_outcomes(passed=4, errors=1)
+    result.stdout.fnmatch_lines(["*an exception has ended a thread: LookupError: in a thread, in mine; *"])
+
+
+def test_an_async_generator_that_is_left_open_is_told(suite) -> None:
+    result = suite(
+        """
+kept = []
+
+async def numbers():
+    try:
+        yield 1
+        yield 2
+    finally:
+        await asyncio.sleep(0)
+
+@pytest.fixture
+async def number():
+    yield 1
+
+async def test_leaves(actor_system):
+    kept.append(numbers())
+    assert await anext(kept[-1]) == 1
+
+@pytest.mark.holdfast(leaks="generators")
+async def test_may(actor_system):
+    kept.append(numbers())
+    await anext(kept[-1])
+
+async def test_closes(actor_system, number):
+    kept.append(numbers())
+    await anext(kept[-1])
+    await kept[-1].aclose()
+
+async def test_drops(number, actor_system):
+    async for _ in numbers():
+        break
+
+async def test_ends(actor_system):
+    kept.append(numbers())
+    assert [one async for one in kept[-1]] == [1, 2]
+""",
+        holdfast_loops="asyncio",
+    )
+    result.assert_outcomes(passed=5, errors=1)
+    result.stdout.fnmatch_lines(["*an async generator was left open: numbers at *test_*.py; close it (aclose)"])
+
+
 def test_a_kind_of_leak_that_there_is_not_is_refused(suite) -> None:
     result = suite("""
 @pytest.mark.holdfast(leaks="sockets")
 async def test_leaks(actor_system): ...
 """)
-    result.stdout.fnmatch_lines(["*'sockets' is none of descriptors, processes, tasks, threads, timers*"])
+    result.stdout.fnmatch_lines(
+        ["*'sockets' is none of descriptors, generators, processes, signals, tasks, threads, timers*"]
+    )
 
 
 EXCEPTIONS = {

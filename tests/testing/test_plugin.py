@@ -451,6 +451,26 @@ async def test_adds(actor_system):
     result.stdout.no_fnmatch_line("*was left running*")
 
 
+@pytest.mark.parametrize("fixture", ["actor_system", "actor_systems", "sim_fleet", "probe"])
+def test_a_test_that_is_refused_spoils_no_other(pytester: pytest.Pytester, fixture: str) -> None:
+    tests = f"""
+@pytest.mark.anyio
+async def test_refused({fixture}):
+    pass
+
+@pytest.mark.asyncio(loop_factories=["virtual"])
+async def test_later({fixture}):
+    pass
+
+@pytest.mark.asyncio(loop_factories=["virtual"])
+async def test_much_later({fixture}):
+    pass
+"""
+    run_suite(pytester, HEAD + tests, asyncio_mode="strict", holdfast_loops="asyncio").assert_outcomes(
+        passed=2, errors=1
+    )
+
+
 # -- simulate --------------------------------------------------------------------------------------------------------
 
 

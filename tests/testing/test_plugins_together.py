@@ -11,7 +11,7 @@ from importlib.metadata import entry_points
 import pytest
 
 from tests.pairs import covering
-from tests.testing.suites import CONFTEST
+from tests.testing.suites import CONFTEST, HEAD
 
 TESTS = """
 import asyncio
@@ -184,3 +184,45 @@ def test_the_plugins_are_there() -> None:
     """Else the rows above would show nothing."""
     names = {one.name for one in entry_points(group="pytest11")}
     assert {*OTHERS, "asyncio"} <= names
+
+
+HANGS = """
+import itertools, time
+from holdfast.testing import simulate
+
+runs = itertools.count(1)
+
+class Beat(hf.Actor):
+    def on_start(self, restored):
+        self.ctx.every(1.0, Add(1))
+
+    @hf.on(Add)
+    def beat(self, message):
+        return 1
+
+@simulate(seeds=5)
+async def test_hangs(system):
+    print("run", next(runs))
+    system.spawn(hf.start(Beat))
+    await asyncio.Event().wait()
+
+@simulate(seeds=5)
+async def test_is_slow_to_fail(system):
+    if next(runs) > 1:
+        time.sleep(10)
+    assert False, "of its own"
+"""
+
+
+def test_a_time_limit_is_no_failure_to_repeat(pytester: pytest.Pytester) -> None:
+    result = session(pytester, HEAD + HANGS, "--timeout=2", "--timeout-method=signal", "-k", "hangs")
+    result.assert_outcomes(failed=1)
+    result.stdout.fnmatch_lines(["*its time was over in the run of seed 0*", "run 1"])
+    result.stdout.no_fnmatch_line("run 2")
+    result.stdout.no_fnmatch_line("*cannot be repeated*")
+
+
+def test_a_time_limit_while_a_failure_is_shrunk_leaves_that_failure(pytester: pytest.Pytester) -> None:
+    result = session(pytester, HEAD + HANGS, "--timeout=2", "--timeout-method=signal", "-k", "slow")
+    result.assert_outcomes(failed=1)
+    result.stdout.fnmatch_lines(["*of its own*", "*the time of the test was over before this failure, of seed 0*"])

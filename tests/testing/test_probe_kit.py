@@ -1,6 +1,7 @@
 """Probes as users of other test kits know them: unordered expects, a common limit, autopilot, forward, taps, events."""
 
 import asyncio
+from typing import Any
 
 import pytest
 
@@ -238,6 +239,45 @@ async def test_a_tap_between_two_sees_only_these(actor_system: GuardedSystem, pr
     one.tell(Order(counter, 5))
     await idle(actor_system)
     assert (probe.waiting, await counter.ask(Total())) == ((), 8)
+
+
+PLACES: dict[str, dict[str, Any]] = {
+    "task": {},
+    "process": {"isolation": "process"},
+    "recorded": {"recovery": hf.hybrid()},
+}
+BOTH = {**PLACES, "recorded process": {**PLACES["process"], **PLACES["recorded"]}}
+
+
+@pytest.mark.parametrize("to", BOTH)
+@pytest.mark.parametrize("by", BOTH)
+async def test_a_tap_sees_what_one_actor_sends_another_wherever_they_live(
+    actor_system: GuardedSystem, probe: Probe, by: str, to: str
+) -> None:
+    sender = await actor_system.start(hf.child("sender", hf.start(Sender), **BOTH[by]))
+    counter = await actor_system.start(hf.child("counter", hf.start(Counter), **BOTH[to]))
+    pair = probe_of(actor_system)
+    with probe.tap(counter), pair.tap(sender, counter):
+        sender.tell(Order(counter, 7))
+        await probe.expect(Add(7))
+        await pair.expect(Add(7))
+        assert (probe.sender, pair.sender) == (sender, sender)
+    assert await counter.ask(Add(1)) == 8
+    await pair.expect_no_message()
+
+
+async def test_a_tap_is_refused_where_messages_never_leave_a_process(actor_system: GuardedSystem, probe: Probe) -> None:
+    children = [hf.child("one", hf.start(Sender)), hf.child("two", hf.start(Counter))]
+    await actor_system.start(hf.supervisor("far", isolation="process", children=children))
+    near = await actor_system.start(hf.child("near", hf.start(Sender), isolation="process"))
+    one, two = actor_system.ref("/app/far/one", Sender), actor_system.ref("/app/far/two", Counter)
+    with pytest.raises(hf.SpecError, match=r"/app/far/two lives in another process, and what whoever lives there"):
+        probe.tap(two)
+    with pytest.raises(hf.SpecError, match=r"what /app/far/one sends to it never leaves that"):
+        probe.tap(one, two)
+    with probe.tap(near, two):
+        near.tell(Order(two, 3))
+        await probe.expect(Add(3))
 
 
 async def test_two_taps_at_one_address_end_in_any_order(actor_system: GuardedSystem, probe: Probe) -> None:

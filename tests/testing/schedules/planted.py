@@ -401,6 +401,59 @@ class Killer(hf.Actor):
         self.to.kill()
 
 
+class Walker(hf.Actor):
+    """Notes each of its steps before it tells itself the next one."""
+
+    def __init__(self, got: list[str], steps: int) -> None:
+        self.got, self.steps = got, steps
+
+    @hf.on(Step)
+    def step(self, message: Step) -> None:
+        self.got.append(f"{self.ctx.path.rpartition('/')[2]}{message.number}")
+        if message.number < self.steps:
+            self.ctx.ref.tell(Step(message.number + 1))
+
+
+async def between_two_steps(system: GuardedSystem) -> None:
+    """One comes between the third and the fourth step of another: no order of priorities does that."""
+    got: list[str] = []
+    for name, steps in (("long", 6), ("short", 1)):
+        system.spawn(hf.start(Walker, got, steps), name).tell(Step(1))
+    await idle(system)
+    assert "long3 short1 long4" not in " ".join(got)
+
+
+class Gate(hf.Actor):
+    """Lets on who comes in the right order, and nobody else."""
+
+    def __init__(self, rounds: int) -> None:
+        self.rounds, self.number, self.first = rounds, 0, -1
+
+    @hf.on(Go)
+    def open(self, message: Go) -> None:
+        if self.number == self.rounds:
+            raise RuntimeError("every gate is open")
+        self.first = -1
+        for number in range(2):
+            self.ctx.spawn(hf.start(Teller, self.ctx.ref, number), f"round{self.number}teller{number}").tell(Go())
+
+    @hf.on(Step)
+    def step(self, message: Step) -> None:
+        if self.first < 0:
+            self.first = message.number
+            if self.first == 1:
+                self.number += 1
+                self.ctx.ref.tell(Go())
+
+
+async def one_gate_after_the_other(system: GuardedSystem) -> None:
+    """In each of twelve rounds the last of two has to come first, and the next round begins only then."""
+    gate = system.spawn(hf.start(Gate, 12), "gate")
+    gate.tell(Go())
+    await idle(system)
+    assert not gate._cell.is_dead
+
+
 PLANTED: dict[str, Planted] = {
     planted.__name__: planted
     for planted in (

@@ -23,6 +23,7 @@ from holdfast.testing import GuardedSystem, simulate
 from holdfast.testing.schedules.choices import NotRepeatable, Production, Walk
 from holdfast.testing.schedules.world import EPOCH, EscapesSimulation
 from holdfast.testing.simulation import run_schedule
+from tests.testing.schedules import by_name
 
 
 class Go(hf.Message):
@@ -230,6 +231,26 @@ async def test_a_strict_actor_is_refused_a_simulated_clock_as_it_is_a_real_one(
         await ref.ask(Read(which))
     free = await system.start(hf.child("free", hf.start(Reader), recovery=hf.hybrid()))
     assert await free.ask(Read(which))
+
+
+def test_what_a_module_has_by_name_is_the_seeds_too() -> None:
+    seen: list[list[str]] = []
+
+    async def looks(system: GuardedSystem) -> None:
+        seen.append(await system.spawn(hf.start(by_name.Looker)).ask(by_name.Look()))
+
+    real = [by_name.what_time_it_is, by_name.urandom, by_name.OWN.getstate(), by_name.NEW.bit_generator.state]
+    for seed in (1, 1, 2):
+        run_schedule(looks, Production(seed), {"system"}, {})
+        assert [
+            by_name.what_time_it_is,
+            by_name.urandom,
+            by_name.OWN.getstate(),
+            by_name.NEW.bit_generator.state,
+        ] == real
+    assert seen[0] == seen[1]
+    assert float(seen[0][0]) == EPOCH
+    assert not {*seen[0][4:]} & {*seen[2]}
 
 
 class Note(hf.Message[str]):

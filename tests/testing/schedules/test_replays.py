@@ -1,6 +1,9 @@
 """A schedule that is to be repeated fits its test, or the test fails: what passed would be another run."""
 
+import os
 import re
+import subprocess
+import sys
 
 import pytest
 
@@ -88,7 +91,7 @@ def test_what_is_known_of_a_failure_is_kept_where_it_is_asked_for(pytester: pyte
     assert result.ret == 1
     (folder,) = (pytester.path / "artefacts").iterdir()
     assert sorted(file.name for file in folder.iterdir()) == ["chart.html", "failure.txt", "schedule.txt"]
-    schedule = (folder / "schedule.txt").read_text("utf-8").strip()
+    schedule = (folder / "schedule.txt").read_text("utf-8").partition(" hash=")[0]
     told = (folder / "failure.txt").read_text("utf-8").splitlines()
     assert told[0].endswith("::test_it")
     assert "AssertionError" in told[1]
@@ -102,3 +105,101 @@ def test_what_is_known_of_a_failure_is_kept_where_it_is_asked_for(pytester: pyte
 def test_where_nothing_fails_nothing_is_kept(pytester: pytest.Pytester) -> None:
     assert run_suite(pytester, HEAD + FAILS.replace("== 2", "== 1"), "--holdfast-record", "artefacts").ret == 0
     assert not (pytester.path / "artefacts").exists()
+
+
+KNOWS_ITS_PROCESS = """
+import os
+from holdfast.testing import simulate
+
+@simulate(seeds=20)
+async def test_order(system):
+    assert os.environ["MENDED"] or min({"anna", "bert", "carl", "dora"}, key=hash) != "FIRST"
+"""
+
+
+def under(pytester: pytest.Pytester, seed: str, *args: str, mended: str = "") -> pytest.RunResult:
+    """The same suite in a process whose strings have other hashes."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONHASHSEED", seed)
+        patch.setenv("MENDED", mended)
+        return pytester.runpytest_subprocess("-p", "no:randomly", *args)
+
+
+def suite_that_fails_under_seed_1(pytester: pytest.Pytester) -> None:
+    program = 'print(min({"anna", "bert", "carl", "dora"}, key=hash))'
+    first = {
+        seed: subprocess.run(
+            [sys.executable, "-c", program], env={**os.environ, "PYTHONHASHSEED": seed}, check=True, capture_output=True
+        ).stdout.decode()
+        for seed in ("1", "2")
+    }
+    assert first["1"] != first["2"]
+    run_suite(pytester, HEAD + KNOWS_ITS_PROCESS.replace("FIRST", first["1"].strip()), "--collect-only")
+
+
+def test_a_schedule_is_repeated_under_its_hash_seed_only(pytester: pytest.Pytester) -> None:
+    suite_that_fails_under_seed_1(pytester)
+    failed = under(pytester, "1", "--holdfast-record", "artefacts", "-p", "no:cacheprovider")
+    failed.assert_outcomes(failed=1)
+    failed.stdout.fnmatch_lines(["*under PYTHONHASHSEED=1", "*repeat it: PYTHONHASHSEED=1 pytest --holdfast-replay *"])
+    (folder,) = (pytester.path / "artefacts").iterdir()
+    assert (folder / "schedule.txt").read_text("utf-8") == "seed=0 hash=1\n"
+    replay = "--holdfast-replay", str(folder / "schedule.txt")
+    under(pytester, "1", *replay).assert_outcomes(failed=1)
+    refused = under(pytester, "2", *replay)
+    refused.assert_outcomes(failed=1)
+    refused.stdout.re_match_lines([r".*OtherHashSeed: .*Run PYTHONHASHSEED=1 pytest --holdfast-replay .*::test_order'"])
+    (folder / "schedule.txt").write_text("seed=0 hash=random\n", "utf-8")
+    told = under(pytester, "2", *replay)
+    told.assert_outcomes(passed=1, warnings=1)
+    told.stdout.fnmatch_lines(["*PassesElsewhere: the schedule 'seed=0 hash=random', which has failed*"])
+
+
+def test_a_kept_failure_that_passes_under_another_hash_seed_stays(pytester: pytest.Pytester) -> None:
+    suite_that_fails_under_seed_1(pytester)
+    under(pytester, "1").assert_outcomes(failed=1)
+    for _ in range(2):
+        other = under(pytester, "2")
+        other.assert_outcomes(passed=1, warnings=1)
+    other.stdout.fnmatch_lines(["*PassesElsewhere: *stays kept: run PYTHONHASHSEED=1 pytest '*::test_order'"])
+    under(pytester, "1").assert_outcomes(failed=1)
+    under(pytester, "1", mended="yes").assert_outcomes(passed=1)
+    under(pytester, "2").assert_outcomes(passed=1)
+
+
+TELLS_ITS_SEEDS = """
+from pathlib import Path
+from holdfast.testing import simulate
+
+@simulate(seeds=5)
+async def test_seeds(system, simulation):
+    with Path("seeds.txt").open("a") as file:
+        print(simulation.seed, file=file)
+    assert simulation.seed != 3
+"""
+
+
+def seeds_run(pytester: pytest.Pytester, *args: str) -> list[int]:
+    """The seeds of a run of the suite, in their order."""
+    pytester.runpytest_inprocess("-p", "no:randomly", "-W", "ignore:the schedule", *args)
+    file = pytester.path / "seeds.txt"
+    seeds = [int(line) for line in file.read_text("utf-8").splitlines()]
+    file.unlink()
+    return seeds
+
+
+def test_what_has_failed_is_tried_first_until_it_passes(pytester: pytest.Pytester) -> None:
+    run_suite(pytester, HEAD + TELLS_ITS_SEEDS, "--collect-only")
+    assert seeds_run(pytester)[:3] == [0, 0, 1]
+    assert {*seeds_run(pytester)} == {3}
+    pytester.makepyfile(HEAD + TELLS_ITS_SEEDS.replace("!= 3", ">= 0"))
+    assert seeds_run(pytester)[:4] == [3, 0, 0, 1]
+    assert seeds_run(pytester)[:3] == [0, 0, 1]
+
+
+@pytest.mark.parametrize(
+    ("args", "count"), [((), 5), (("--holdfast-profile", "ci"), 5), (("--holdfast-profile", "nightly"), 125)]
+)
+def test_a_profile_has_its_number_of_seeds(pytester: pytest.Pytester, args: tuple[str, ...], count: int) -> None:
+    run_suite(pytester, HEAD + TELLS_ITS_SEEDS.replace("!= 3", ">= 0"), "--collect-only")
+    assert {*seeds_run(pytester, *args)} == {*range(count)}

@@ -38,7 +38,18 @@ from holdfast.testing.schedules.shrinking import shrink
 from holdfast.testing.schedules.strategies import NAMES, Priorities, mixed, strategy
 from holdfast.testing.schedules.world import EPOCH, EscapesSimulation
 from holdfast.testing.simulation import NotExhausted, ScheduleSearch, SimulationSettings, run_schedule
-from tests.testing.schedules.planted import PLANTED, Go, Note, Planted, Step, Teller, order_of, restart_order
+from tests.testing.schedules.planted import (
+    PLANTED,
+    Go,
+    Note,
+    Planted,
+    Step,
+    Teller,
+    between_two_steps,
+    one_gate_after_the_other,
+    order_of,
+    restart_order,
+)
 
 OWN = {"system"}
 SHOWN_BY_PRODUCTION = {"late_reply", "recorded_non_determinism"}
@@ -81,10 +92,17 @@ def test_the_default_finds_a_planted_bug_and_shrinks_it(name: str) -> None:
     assert "turns:" in note
 
 
-@pytest.mark.parametrize("name", [name for name in PLANTED if name not in SHOWN_BY_PRODUCTION])
-def test_the_order_of_production_shows_none_of_them(name: str) -> None:
+@pytest.mark.parametrize(
+    "planted",
+    [
+        *(PLANTED[name] for name in PLANTED if name not in SHOWN_BY_PRODUCTION),
+        between_two_steps,
+        one_gate_after_the_other,
+    ],
+)
+def test_the_order_of_production_shows_none_of_them(planted: Planted) -> None:
     """Else they would be no bugs that a test has to look for."""
-    run_schedule(PLANTED[name], Production(0), OWN, {})
+    run_schedule(planted, Production(0), OWN, {})
 
 
 @pytest.mark.parametrize("name", ["order_of_3", "missed_wake_up", "timer_tie", "restart_order"])
@@ -103,6 +121,31 @@ def test_priorities_find_an_order_as_often_as_they_promise(count: int) -> None:
         except AssertionError:
             hits += 1
     assert hits / runs >= 1 / ((count + 2) * (2 * count) ** (count - 1))
+
+
+def test_priorities_that_change_find_what_no_order_of_priorities_shows() -> None:
+    """At least 1 / (n k) of the runs, with n = 3 tasks (the test's is one) and k choices, as the first run tells."""
+
+    def hits(depth: int) -> tuple[int, int]:
+        tried, found, longest = strategy("pct", depth), 0, 0
+        for number in range(300):
+            choices = tried.choices(number)
+            assert choices is not None
+            try:
+                tried.learn(choices, run_schedule(between_two_steps, choices, OWN, {}, looks=False).trace)
+                longest = max(longest, choices.steps)
+            except AssertionError:
+                found += 1
+        return found, longest
+
+    assert hits(1)[0] == 0
+    found, longest = hits(2)
+    assert found / 300 >= 1 / (3 * longest)
+
+
+def test_what_was_new_is_built_on() -> None:
+    assert runs_needed(one_gate_after_the_other, "coverage") is not None
+    assert runs_needed(one_gate_after_the_other, "mixed") is None
 
 
 def test_the_exhaustive_search_sees_each_order_and_ends() -> None:
@@ -439,18 +482,28 @@ def test_a_strategy_that_there_is_not_is_refused(options: dict[str, Any]) -> Non
         simulate(restart_order, **options)
 
 
-def test_no_order_of_a_set_changes_a_run() -> None:
-    """Strings have other hashes in each process."""
-    player = Path(__file__).with_name("hash_player.py")
+def in_two_processes(player: str) -> list[list[str]]:
+    """What a program prints where strings have other hashes."""
     runs = [
         subprocess.Popen(
-            [sys.executable, str(player)],
+            [sys.executable, str(Path(__file__).with_name(player))],
             env={**os.environ, "PYTHONHASHSEED": seed, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
             stdout=subprocess.PIPE,
         )
         for seed in ("1", "2")
     ]
-    first, again = (run.communicate(timeout=120)[0].decode().splitlines() for run in runs)
+    printed = [run.communicate(timeout=120)[0].decode().splitlines() for run in runs]
     assert [run.returncode for run in runs] == [0, 0]
+    return printed
+
+
+def test_no_order_of_a_set_changes_a_run() -> None:
+    first, again = in_two_processes("hash_player.py")
     assert len(first) > 1000
     assert first == again
+
+
+def test_a_set_of_refs_has_one_order_in_every_process() -> None:
+    first, again = in_two_processes("refs_player.py")
+    assert first == again
+    assert first[1] == "True"

@@ -371,6 +371,13 @@ class ForgetsNeededPacks(OneFile):
         super().forget_blocks(address, [number for owner, number in self._contents.blocks if owner == address][:-1])
 
 
+class ForgetsFiftyPacks(OneFile):
+    """Forgets fifty packs at a time, and leaves the rest."""
+
+    def forget_blocks(self, address: str, numbers: Collection[int]) -> None:
+        super().forget_blocks(address, sorted(numbers)[:50])
+
+
 class ForgetsPacksOfOthers(OneFile):
     """Forgets by number, whosever a pack is."""
 

@@ -61,6 +61,14 @@ class IgnoresRanges(OneFile):
         super().cut(address, snapshot, [] if isinstance(drop, range) else drop, turn=turn, keep=keep)
 
 
+class IgnoresSteps(OneFile):
+    """Takes a range with a step for one without."""
+
+    def cut(self, address: str, snapshot: bytes, drop: Drop, *, turn: int, keep: int = 2) -> None:
+        whole = range(drop.start, drop.stop) if isinstance(drop, range) else drop
+        super().cut(address, snapshot, whole, turn=turn, keep=keep)
+
+
 class DropsOfAllAddresses(MoreThanACut):
     """Forgets the positions in `drop` whosever they are."""
 

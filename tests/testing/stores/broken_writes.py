@@ -20,6 +20,14 @@ class EpochStays(OneFile):
         self.epoch = 1
 
 
+class EpochInFourBits(OneFile):
+    """Begins with the first epoch again after sixteen openings."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self.epoch %= 16
+
+
 class WritesAtClose(OneFile):
     """Has something in memory alone until it is closed in good order."""
 
@@ -238,6 +246,13 @@ class NeverSyncs(OneFile):
         beside = self.path.with_suffix(".new")
         beside.write_bytes(pickle.dumps(contents))
         os.replace(beside, self.path)
+
+    def _sync(self) -> None:
+        pass
+
+
+class SyncsFilesAlone(OneFile):
+    """Syncs each file and never its name: a power failure brings the file before it back."""
 
     def _sync(self) -> None:
         pass

@@ -30,6 +30,30 @@ BASES = (
     broken_writes.WritesAtClose,
 )
 """What they are derived from, and breaks nothing itself."""
+ALWAYS = (
+    broken_entries.WritesAppendsLater,
+    broken_entries.EntryByEntry,
+    broken_entries.PositionsAgain,
+    broken_entries.AThousandAtMost,
+    broken_entries.TenAddresses,
+    broken_names.EraseForgetsNotes,
+    broken_names.ErasesBelow,
+    broken_names.FoldsCase,
+    broken_names.KeysEndAtNul,
+    broken_names.ForgetsFiftyPacks,
+    broken_snapshots.OlderOnesInMemory,
+    broken_snapshots.ForgetsNotesAtACut,
+    broken_snapshots.ForgetsPacksAtACut,
+    broken_snapshots.IgnoresRanges,
+    broken_snapshots.IgnoresSteps,
+    broken_writes.EpochAtClose,
+    broken_writes.EpochInFourBits,
+    broken_writes.NotesAtClose,
+    broken_writes.NobodyIsLockedOut,
+    broken_writes.RaisesWhatItGets,
+    broken_writes.SyncsFilesAlone,
+)
+"""Those that are judged each time: the others take turns."""
 SEEDS = 3
 
 
