@@ -4,7 +4,8 @@ What is recorded of an actor stays under the key that it was first kept under, w
 another supervisor writes one note instead of a journal. Both tables are in the store, so the next root has them too:
 who kept only an old address, in a state or in a message that waits, still reaches the actor.
 
-What recorded actors hold in registries is noted by both addresses, and moves along.
+What recorded actors hold in registries is noted by both addresses, and moves along. A tree of addresses tells which of
+them are below another one, without a look at all the others.
 """
 
 from __future__ import annotations
@@ -18,9 +19,10 @@ from ..actors.persistence import ENTRIES, entries_key
 from .engine_calls import Called
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from ..actors.kernel.node import Node
+    from .absentees import Absentees
     from .journal import Journal
 
 LEFT = "moved from "
@@ -52,8 +54,10 @@ def is_at(path: str, top: str) -> bool:
 class Addresses:
     """Where those live who were moved. An address that was left is forgotten when somebody else comes to live there."""
 
-    def __init__(self, node: Node, journal: Journal, recorded: Callable[[str], Cell | None]) -> None:
-        self._node, self._journal, self._recorded = node, journal, recorded
+    def __init__(
+        self, node: Node, journal: Journal, recorded: Callable[[str], Cell | None], absentees: Absentees
+    ) -> None:
+        self._node, self._journal, self._recorded, self.absentees = node, journal, recorded, absentees
         self._left = {at.removeprefix(LEFT): now.decode() for at, now in journal.notes(LEFT).items()}
         keys = {at.removeprefix(KEY): key.decode() for at, key in journal.notes(KEY).items()}
         self._keys = journal.keys if isinstance(journal, Called) else {}  # Of what is in memory only, nothing is read.
@@ -275,3 +279,59 @@ def _addresses(key: str) -> tuple[str, str]:
     """The addresses of the holder and of the registry."""
     holder, _, registry = key.removeprefix(ENTRIES).partition("\n")
     return holder, registry
+
+
+class AddressTree:
+    """A set of addresses; what is asked of one costs what is at and below it.
+
+    >>> tree = AddressTree(["/app/a", "/app/a/b/c", "/app/ab"])
+    >>> sorted(tree.below("/app/a")), tree.has("/app/a/b"), "/app/a/b" in tree
+    (['/app/a/b/c'], True, False)
+    >>> sorted(tree.below("")) == ["/app/a", "/app/a/b/c", "/app/ab"]
+    True
+    """
+
+    __slots__ = ("_below", "_paths")
+
+    def __init__(self, paths: Iterable[str] = ()) -> None:
+        self._paths: set[str] = set()
+        self._below: dict[str, dict[str, None]] = {}  # by address, those directly below it that lead to one of ours
+        for path in paths:
+            self.add(path)
+
+    def __contains__(self, path: str) -> bool:
+        return path in self._paths
+
+    def has(self, path: str) -> bool:
+        """Whether this address, or one below it, is among them."""
+        return path in self._paths or path in self._below
+
+    def add(self, path: str) -> None:
+        """Add an address; once is enough."""
+        self._paths.add(path)
+        while path and path not in self._below.get(above := path.rpartition("/")[0], ()):
+            self._below.setdefault(above, {})[path] = None
+            path = above
+
+    def discard(self, path: str) -> None:
+        """Take an address out, if it is there."""
+        self._paths.discard(path)
+        while path and not self.has(path):
+            above = path.rpartition("/")[0]
+            siblings = self._below.get(above, {})
+            siblings.pop(path, None)
+            if not siblings:
+                self._below.pop(above, None)
+            path = above
+
+    def below(self, top: str) -> Iterator[str]:
+        """Those below an address; none may come or go meanwhile."""
+        waiting = [iter(self._below.get(top, ()))]
+        while waiting:
+            path = next(waiting[-1], None)
+            if path is None:
+                waiting.pop()
+                continue
+            if path in self._paths:
+                yield path
+            waiting.append(iter(self._below.get(path, ())))

@@ -83,7 +83,7 @@ class DurableTies:
         if not self._kept and not self._untied:
             return
         for _, path in self._kept:
-            self._home.homes.absent.over(path, self)
+            self._home.homes.addresses.absentees.over(path, self)
         self._untied = Counter(self._kept)
         if not is_read:
             self._note_others()
@@ -102,7 +102,7 @@ class DurableTies:
             return
         untied, self._untied = self._untied, Counter()
         others, self._others = self._others, {}
-        node, absent = self._home.node, self._home.homes.absent
+        node, absent = self._home.node, self._home.homes.addresses.absentees
         for verb, path in untied.elements():
             other = node.find(path)
             if other is None or other.is_dead:
@@ -134,7 +134,7 @@ class DurableTies:
     def _tie(self, verb: str, path: str) -> None:
         home = self._home
         cell, other = home.cell, home.node.find(path)
-        home.homes.absent.over(path, self)
+        home.homes.addresses.absentees.over(path, self)
         if cell is None or other is None or cell.is_dead:
             return
         if tied(cell, other, verb) < self._kept[verb, path]:  # Else it was undone while the other one was awaited.

@@ -498,7 +498,7 @@ class Supervisor(Inquiries):
             self._restart(one, reason)
 
     def _start_now(self, one: Child, number: int) -> None:
-        """As `_retry`, by order."""
+        """Try at once, by order, to start a child that is in a back-off."""
         if number == one.retry and one.state == RESTARTING:
             one.due = None
             self._errand(self._bring_back(one, [one]))

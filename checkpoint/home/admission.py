@@ -353,7 +353,7 @@ class Withdrawal:
         self._positions += positions
 
     def safe(self) -> None:
-        """It lasts."""
+        """What it has written outlives the program from now on."""
         self._tell(True)
 
     def refused(self, error: HoldfastError) -> bool:

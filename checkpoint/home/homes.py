@@ -10,8 +10,8 @@ from ...actors.errors import ControlFailed, HoldfastError, StartFailed
 from ...actors.events import RecordsMapped, RecoveryFailed
 from ...actors.kernel.cell import DOWN, GONE, Cell
 from ...actors.persistence import CHILDREN, ENTRIES, child_key
-from ..address_tree import AddressTree
-from ..addresses import Addresses, is_of_actor, renamed
+from ..absentees import Absentees
+from ..addresses import Addresses, AddressTree, is_of_actor, renamed
 from ..group_commit import Commits, Unkept
 from ..inputs import HomeJournal
 from ..journal import Saved, StoreEngine
@@ -23,7 +23,6 @@ from ..snapshot.rollback import older_snapshot, roll_back
 from ..snapshot.snapshot_groups import Groups
 from ..snapshot.snapshot_record import take_over
 from ..snapshot.snapshot_schedule import nobody
-from .absent import Absent
 from .ask_recovery import FarMail, Rejoin
 from .capacity import HomeBound
 from .disposal import Erased, Erasures, drop_all, forget_home, put_into_quarantine
@@ -66,7 +65,7 @@ class Homes:
         self.node = node
         self.journal = Commits(journal, node.loop, durability=durability or "os", emit=node.emit, where=f"/{node.name}")
         self._unkept = Unkept(self.journal)
-        self.addresses = Addresses(node, journal, self.find)
+        self.addresses = Addresses(node, journal, self.find, Absentees(node, self.noted, self.has_recorded))
         self.quarantine = Quarantine(node, self.journal)
         self._switches: dict[str, Switch] = {}
         self.recoveries = Recoveries(node, self.journal, hooks)
@@ -84,7 +83,6 @@ class Homes:
         self.rejoin = Rejoin(self, bears_repetition)
         self.far = FarMail(self)
         self.erasures = Erasures(self)
-        self.absent = Absent(self)
 
     def of(self, cell: Cell, method: Method) -> Switch:
         """The home of an address; taken up from the store when it is first asked for.
@@ -229,7 +227,7 @@ class Homes:
                     switch.readdress(path)
                 switch.ties.rename(lambda one: renamed(names, one))
             self.rejoin.rename(paths)
-            self.absent.rename(lambda one: renamed(names, one))
+            self.addresses.absentees.rename(lambda one: renamed(names, one))
 
     def _move_stored(self, names: Mapping[str, str], paths: Mapping[str, str]) -> None:
         for path in {now for now in paths.values() if now not in paths and self.knows(now)}:
@@ -399,14 +397,14 @@ class Homes:
             tell(path)
         if not below:
             return
-        self.absent.dismissed(path)
+        self.addresses.absentees.dismissed(path)
         for waiting in self.known(path):
             if (switch := self._switches.get(waiting)) is not None:
                 end_wait(switch)
 
     def began(self, path: str, listed: Collection[str]) -> None:
         """The supervisor at `path` begins with these children: nobody else is brought back below it."""
-        self.absent.began(path, listed)
+        self.addresses.absentees.began(path, listed)
 
     def note(self, key: str, value: bytes | None) -> None:
         """Keep a small fact; None forgets it."""

@@ -16,7 +16,7 @@ from ...actors.kernel.cell import DOWN, RUNNING, Cell
 from ...actors.kernel.lifecycle import HERE, NEAR
 from ...actors.persistence import CHILDREN
 from ...actors.process.wire import frames
-from ..address_tree import AddressTree
+from ..addresses import AddressTree
 from ..method import Method
 from ..protocol import (
     Begin,

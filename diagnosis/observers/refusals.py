@@ -61,7 +61,7 @@ class Refusals:
         self._records = defaultdict[str, _Record](_Record)
 
     def take(self, asker: str | None, by: str, error: Refusal, now: float) -> None:
-        """An ask was refused."""
+        """An ask was refused: by whom it was answered, or by whoever refused that one the same."""
         passed_on = self._last.get(by)
         if passed_on is not None and passed_on.error == error and now - passed_on.when <= self._recent:
             by = passed_on.by
@@ -78,7 +78,7 @@ class Refusals:
             record.ended = (*recent_restarts(record.ended, now, WITHIN), now)
 
     def answers(self, component: str) -> None:
-        """It has answered otherwise."""
+        """A component has answered something other than a refusal."""
         record = self._records[component]
         record.others += 1
         record.longest, record.run, record.ended = max(record.longest, record.run), 0, ()

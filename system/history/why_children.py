@@ -71,7 +71,7 @@ class Starts:
 
     @property
     def first(self) -> float:
-        """When that began."""
+        """When the first of these starts was, or failed."""
         return min(event.at for event in (*self.restarts, *self.failed))
 
 

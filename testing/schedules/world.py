@@ -10,8 +10,10 @@ from __future__ import annotations
 import asyncio
 import datetime
 import functools
+import gc
 import os
 import random
+import re
 import socket
 import stat
 import subprocess
@@ -31,7 +33,6 @@ from ..swaps import Swaps
 from ..threads import Onlooker
 from .bound_names import BoundNames, OwnStates
 from .numbered import as_completed, numbering, scope_in_order
-from .shown_addresses import shown_address
 
 if TYPE_CHECKING:
     from .control import ControlledLoop
@@ -40,6 +41,8 @@ EPOCH = 1_700_000_000.0
 """Unix time at which each simulated run begins."""
 NODE = 0x010000000001
 """The machine in a UUID of version 1."""
+SHOWN = re.compile(rb" at 0x([0-9a-f]+)")
+"""How texts show the address of an object in memory, if its class says nothing else."""
 
 
 class EscapesSimulation(UserWarning):
@@ -298,3 +301,20 @@ def _kind_of_file(fd: Any) -> str:
 
 def _name(function: Any) -> str:
     return f"{getattr(function, '__module__', '')}.{getattr(function, '__qualname__', repr(function))}"
+
+
+def shown_address(body: bytes) -> str | None:
+    """Of which class the object is whose address is shown in a value's bytes; None: of nothing that lives.
+
+    To find out whether it lives takes milliseconds, and is done only where there is such a text. Objects that the
+    collector does not know, such as those of `object` itself, are not found.
+
+    >>> class Account: ...
+    >>> account = Account()
+    >>> shown_address(f"opened {account}".encode()), shown_address(b"<Account object at 0x10>")
+    ('Account', None)
+    """
+    addresses = {int(number, 16) for number in SHOWN.findall(body)}
+    if not addresses:
+        return None
+    return next((type(one).__qualname__ for one in gc.get_objects() if id(one) in addresses), None)

@@ -61,7 +61,7 @@ CHECKS = {
         "told_of_once and made and house and task",
     ),
     "who waits hears of a supervisor that begins without the other one": Check(
-        "checkpoint/home/absent.py",
+        "checkpoint/absentees.py",
         "            for ties in self._waiting.pop(path):\n                ties.end(path)\n",
         "            self._waiting.pop(path)\n",
         TO_THE_GONE,
@@ -75,21 +75,21 @@ CHECKS = {
         "told_of_once and stranger and task",
     ),
     "who goes on with what is recorded is waited for": Check(
-        "checkpoint/home/absent.py",
+        "checkpoint/absentees.py",
         "return name not in listed and not self._may_return(at)",
         "return name not in listed",
         TO_THE_GONE,
         "may_come_back and keyed",
     ),
     "a child of a list that was not started yet is waited for": Check(
-        "checkpoint/home/absent.py",
+        "checkpoint/absentees.py",
         "return name not in listed and not self._may_return(at)",
         "return not self._may_return(at)",
         TO_THE_GONE,
         "may_come_back and listed",
     ),
     "a child that its supervisor has brought back is the same one": Check(
-        "checkpoint/home/absent.py",
+        "checkpoint/absentees.py",
         "if is_anew(one) and (above is None or one.name not in self._listed.get(above.path, ())):",
         "if is_anew(one):",
         TO_THE_GONE,

@@ -10,22 +10,28 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ...actors.kernel.links import MADE_UP_NAME, is_anew
-from ...actors.persistence import CHILDREN
+from ..actors.kernel.links import MADE_UP_NAME, is_anew
+from ..actors.persistence import CHILDREN
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
 
-    from ...actors.kernel.cell import Cell
-    from ..durable_links import DurableTies
-    from .homes import Homes
+    from ..actors.kernel.cell import Cell
+    from ..actors.kernel.node import Node
+    from .durable_links import DurableTies
 
 
-class Absent:
-    """What the supervisors of one program have said of their children, and ties that wait for somebody to come."""
+class Absentees:
+    """What the supervisors of one program have said of their children, and ties that wait for somebody to come.
 
-    def __init__(self, homes: Homes) -> None:
-        self._homes = homes
+    Args:
+        node: of the program.
+        noted: what the store has noted under a key.
+        has_recorded: whether something is recorded at an address.
+    """
+
+    def __init__(self, node: Node, noted: Callable[[str], bytes | None], has_recorded: Callable[[str], bool]) -> None:
+        self._node, self._noted, self._has_recorded = node, noted, has_recorded
         self._listed: dict[str, frozenset[str]] = {}
         self._waiting: dict[str, dict[DurableTies, None]] = {}
 
@@ -40,11 +46,11 @@ class Absent:
 
     @property
     def _top(self) -> str:
-        return f"/{self._homes.node.name}"
+        return f"/{self._node.name}"
 
     def is_gone(self, path: str) -> bool:
         """Whether nobody lives at an address, and whoever has will not live there again."""
-        top, find = self._top, self._homes.node.find
+        top, find = self._top, self._node.find
         if not path.startswith(f"{top}/"):
             return False
         above, names = top, path[len(top) + 1 :].split("/")
@@ -61,8 +67,8 @@ class Absent:
 
     def _may_return(self, path: str) -> bool:
         """Whether something is recorded there for whoever comes; not if its supervisor has noted that nobody will."""
-        noted = self._homes.noted(f"{CHILDREN}{path}")
-        return bool(noted) or (noted is None and self._homes.has_recorded(path))
+        noted = self._noted(f"{CHILDREN}{path}")
+        return bool(noted) or (noted is None and self._has_recorded(path))
 
     def is_another(self, cell: Cell) -> bool:
         """Whether a living actor has its address by an id that was made up since its supervisor has begun."""
@@ -79,7 +85,7 @@ class Absent:
         self._waiting.setdefault(path, {})[ties] = None
 
     def over(self, path: str, ties: DurableTies) -> None:
-        """They wait no more."""
+        """The ties wait for that address no more."""
         waiting = self._waiting.get(path, {})
         waiting.pop(ties, None)
         if not waiting:
