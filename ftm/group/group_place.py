@@ -166,6 +166,8 @@ class GroupPlace(Place):
             await home.replay(cell, group, entered)
             await self.protected(group)
         except BaseException as error:
+            if cell.host.place is not self:
+                return  # It was up, though not protected yet, and its life was carried elsewhere.
             if isinstance(error, asyncio.CancelledError):
                 error = StartFailed(cell.path, "it was stopped while it started")
             failed = error if isinstance(error, StartFailed) else StartFailed(cell.path, str(error))
@@ -562,8 +564,8 @@ class GroupPlace(Place):
         ends = [] if self.group is None else self._ends(self.group)
         await self.dismantle(cell)
         self._ending = None
-        if cell.state is not RUNNING:
-            return
+        if cell.state is not RUNNING or cell.host.place is not self:
+            return  # Its life was carried elsewhere meanwhile, and goes on there.
         if failed is not None:
             reason = next((end for end in (*ends, crash(failed)) if end.common_cause), KILLED)
         if not ordered:

@@ -27,11 +27,12 @@ NUMBERS = 5
 STEPS = ("code", "state", "place")
 KINDS = (*STEPS, "bind")
 FOUND = {
-    "turn_ended": (15, KINDS),
-    "life_ended": (21, KINDS),
-    "state_saved": (19, STEPS),
+    "turn_ended": (15, "process", KINDS),
+    "life_ended": (21, "process", KINDS),
+    "state_saved": (19, "process", STEPS),
+    "group_ended": (101, "task", KINDS),
 }
-"""What has gone wrong when a change came to a player in a process: a seed of it, and the kinds of steps."""
+"""What has gone wrong when a change came to a player: a seed of it, where it lived, and the kinds of steps."""
 PAUSES = (0.0, 0.005, 0.01, 0.02, 0.05, 0.1, 0.3)
 LATENCY = (0.0, 0.02)
 """Seconds that a word to or from a process takes."""
@@ -246,5 +247,5 @@ def test_so_it_is_in_any_order_of_steps(isolation: str) -> None:
 
 @pytest.mark.parametrize("what", FOUND)
 def test_what_was_found_stays_mended(what: str) -> None:
-    seed, kinds = FOUND[what]
-    change(seed, "process", {"seed": seed}, kinds)
+    seed, isolation, kinds = FOUND[what]
+    change(seed, isolation, {"seed": seed}, kinds)
