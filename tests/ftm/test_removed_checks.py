@@ -18,6 +18,13 @@ FAILOVER, CHECKS_ALONE = "tests/ftm/test_failover.py", "tests/ftm/test_checks.py
 AUTHORS = "tests/ftm/test_author_bricks.py"
 REVOKED, LINKS = "tests/ftm/test_revoked_replicas.py", "tests/ftm/sec/test_link.py"
 CHECKS = {
+    "a group whose life has gone elsewhere is no start that has failed": Check(
+        "ftm/group/group_place.py",
+        "            if cell.host.place is not self:\n                return",
+        "            if False:\n                return",
+        "tests/effects/test_changes_of_races.py",
+        "group_ended",
+    ),
     "an answer that is in hand when the backup is lost is told of": Check(
         "ftm/mechanisms/pbr.py",
         "            if standing.other.path is None:  # It was lost with this in hand.\n",
