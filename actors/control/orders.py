@@ -59,7 +59,6 @@ class Suspend(Order):
     """Handle no message until Resume; twice is once."""
 
     verb = "suspend"
-    is_change = True
 
     def run(self, cell: Cell, actor: Actor) -> None:
         mailbox.suspend(cell)
@@ -69,7 +68,6 @@ class Resume(Order):
     """Handle messages again, in the order in which they came."""
 
     verb = "resume"
-    is_change = True
 
     def run(self, cell: Cell, actor: Actor) -> None:
         mailbox.resume(cell)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import msgspec
 
+from ...actors.control.orders import Suspend
 from ...actors.control.orders_lane import QueuedOrder
 from ...actors.effects import EffectCall
 from ...actors.errors import (
@@ -574,6 +575,8 @@ class RecordedContext(ActorContext):
         if self._is_adrift and isinstance(call, QueuedOrder):
             self._cell.urge(call)  # The next life obeys it, before the turn that was left is run again.
             return True
+        if isinstance(call, QueuedOrder) and isinstance(call.order, Suspend):
+            self.recorded.stage.owed = -1  # It is not run before an operator says so: what else is ordered comes first.
         is_behind = self._owes_turn and isinstance(call, QueuedOrder) and call.order.is_change
         if self.recorded.is_live and not is_behind:
             self.recorded.say_it_waits()  # The order may be that nothing is handled.

@@ -118,9 +118,10 @@ class Case:
         steps, self.before_plan = tuple(self.actions[self.before_plan :]), len(self.actions)
         return steps
 
-    def note_useless(self, steps: tuple[Step, ...]) -> None:
-        """The steps that were taken last to be judged have not helped."""
-        self.useless.update(range(self.before_plan - len(steps), self.before_plan))
+    def note_useless(self, steps: tuple[Step, ...], certain: Collection[str]) -> None:
+        """The steps that were taken last to be judged have not helped those that are certainly bad still."""
+        begin = self.before_plan - len(steps)
+        self.useless.update(begin + nth for nth, step in enumerate(steps) if step.args and step.args[0] in certain)
 
     def helpful(self) -> tuple[Step, ...]:
         """The actions that were done, but for those that were seen not to help."""

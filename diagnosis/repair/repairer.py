@@ -491,7 +491,7 @@ class Repairer(Actor):
         if not steps or not suspects & case.midway:
             return  # It was judged before, or others are blamed now: it may have helped.
         self._memory.useless += 1
-        case.note_useless(steps)
+        case.note_useless(steps, self._outlook.diagnosis.certain)
         node, now = self.ctx._cell.node, self.now()
         for step in steps:
             address = self._addresses.get(step.args[0]) if step.args and step.args[0] in suspects else None
