@@ -135,7 +135,8 @@ def noted_plan(declared: Plan, data: bytes) -> Plan:
     for name, (before, packed) in unpack_data(data).items():
         if name in parts and before == _digest(name, parts[name]):
             parts[name] = unpack_data(packed)
-    flags = Flags(**{name: parts[name] for name in FLAGS})
+    given: dict[str, Any] = {name: parts[name] for name in FLAGS}
+    flags = Flags(**given)
     of_template = {name: parts[name] for name in OF_TEMPLATE if name in parts}
     return Plan.of(flags, [dataclasses.replace(one, **of_template) for one in parts[TEMPLATE]])
 

@@ -121,12 +121,10 @@ async def watcher(system: hf.ActorSystem, isolation: str, again: bool) -> hf.Act
 async def main(store: str, isolation: str, kind: str, place: str, order: str, end: str) -> None:
     again = order == "again"
     async with hf.ActorSystem("app", store=f"sqlite:{store}", log=False, intensity=100) as system:
-        if order == "watcher first":
-            ref = await watcher(system, isolation, again)
+        early = await watcher(system, isolation, again) if order == "watcher first" else None
         await house(system, kind, place)
         one = await other(system, kind) if order == "stranger first" or end != "told" else None
-        if order != "watcher first":
-            ref = await watcher(system, isolation, again)
+        ref = early or await watcher(system, isolation, again)
         if end != "told":
             assert one is not None
             await ref.ask(Tie([one.path]), IN_TIME)

@@ -120,9 +120,9 @@ async def test_nor_of_a_turn_that_has_ended_and_was_not_heard_of(tmp_path: Path,
 def test_it_is_never_false_of_what_has_begun_whoever_is_killed(tmp_path: Path, where: str, name: str) -> None:
     """By a ledger outside; also of what a later program has begun."""
     draw = random.Random(f"{where} {name}")
+    command = [sys.executable, "-m", PLAYER, f"sqlite:{tmp_path}/app.db", where, name, str(tmp_path)]
     for program in range(4):
-        command = [sys.executable, "-m", PLAYER, f"sqlite:{tmp_path}/app.db", where, name, str(tmp_path), str(program)]
-        with subprocess.Popen([*command, str(draw.randrange(1 << 30))], cwd=ROOT) as process:
+        with subprocess.Popen([*command, str(program), str(draw.randrange(1 << 30))], cwd=ROOT) as process:
             ends = time.monotonic() + LONG
             while str(program) not in noted(tmp_path / "up"):
                 assert process.poll() is None
@@ -130,7 +130,7 @@ def test_it_is_never_false_of_what_has_begun_whoever_is_killed(tmp_path: Path, w
                 time.sleep(0.01)
             time.sleep(draw.uniform(0.5, 2.0))  # Any moment of its work: what is judged holds at each.
             process.kill()
-    subprocess.run([*command, "-1"], cwd=ROOT, check=True, timeout=120)
+    subprocess.run([*command, "3", "-1"], cwd=ROOT, check=True, timeout=120)
     began, told = noted(tmp_path / "begun"), noted(tmp_path / "told")
     assert len(began) > 20
     assert len(told) > 5

@@ -30,6 +30,7 @@ class First(Player):
         if message.n in dict(self.done):
             return []
         said = await super().play(message)
+        assert isinstance(said, list)
         self.ledger.tell(Step(message.n, len(said), f"by {self.generation}"))
         await self.ctx.publish("/over", Over(message.n, self.generation))
         return [*said, self.generation]

@@ -442,11 +442,11 @@ def fate() -> int:
 class Sitting(hf.Actor):
     """Waits for days; a release that has another effect before that cannot go on with what was begun."""
 
-    draws: ClassVar[Callable[[], int]] = luck
+    draws: ClassVar[list[Callable[[], int]]] = [luck]
 
     @hf.on(Sit)
     async def sit(self, message: Sit) -> None:
-        await self.ctx.effect(type(self).draws)
+        await self.ctx.effect(self.draws[0])
         await self.ctx.sleep(1e6)
 
 
@@ -461,7 +461,7 @@ async def test_who_does_not_come_up_with_a_release_was_not_restarted_and_with_th
         ann = await system.ref("/app/exam/hall", hf.Supervisor).ask(hf.StartChild(id="ann"))
         ann.tell(Sit())
         await until(lambda: "it has slept" in heard(system, system.ref("/app/exam/hall")))
-    monkeypatch.setattr(Sitting, "draws", fate)
+    monkeypatch.setattr(Sitting, "draws", [fate])
     async with hf.ActorSystem("app", store=store, log=False) as system:
         with system.events() as events:
             await system.start(exam)
@@ -475,7 +475,7 @@ async def test_who_does_not_come_up_with_a_release_was_not_restarted_and_with_th
             assert "effect" in told
             assert "restarted" not in told
             assert "ctx.now()" not in told
-    monkeypatch.setattr(Sitting, "draws", luck)
+    monkeypatch.setattr(Sitting, "draws", [luck])
     async with hf.ActorSystem("app", store=store, log=False) as system:
         await system.start(exam)
         await until(lambda: "it has slept" in heard(system, system.ref("/app/exam/hall")))

@@ -33,7 +33,7 @@ CHECKS = {
     ),
     "what has not helped has no credit": Check(
         "diagnosis/repair/repairer.py",
-        "        case.note_useless(steps)\n",
+        "        case.note_useless(steps, self._outlook.diagnosis.certain)\n",
         "",
         LOOP,
         "is_not_what_the_symptoms_went_by",
