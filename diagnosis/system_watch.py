@@ -173,8 +173,8 @@ async def watch(
 
     Raises:
         ModelError: something is wrong with the model. StartFailed, AlreadyStarted: see `ActorSystem.start`.
-        ValueError: there is no such stance of repair, the file of repair is another one, or `limits` name a component
-            that there is not; or so does `expect`.
+        ValueError: there is no such stance of repair, the file of repair is another one, or `limits` or `expect` name a
+            component that there is not.
     """
     check_stance(repair)
     generated = await generate(system, seconds=seconds) if model is None else None

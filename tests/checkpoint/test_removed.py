@@ -228,6 +228,13 @@ CHECKS = {
         "tests/checkpoint/test_forwarded.py",
         "handed_on_is_not_lost and ask-unbounded",
     ),
+    "what is ordered of who is suspended does not wait for a turn that is not run": Check(
+        "checkpoint/life/recorded_context.py",
+        "            self.recorded.stage.owed = -1  # It is not run",
+        "            pass  # It is not run",
+        "tests/checkpoint/test_diverging_in_hand.py",
+        "an_actor_that_is_suspended",
+    ),
     "a stop ends a turn that comes to rest after it": Check(
         "checkpoint/life/recorded_life.py",
         "(self.waits.resting or self.waits.are_stranded)",

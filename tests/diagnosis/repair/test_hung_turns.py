@@ -1,8 +1,10 @@
 """A message whose turn never ends: repair restarts its actor, and the second end in a row puts the message aside."""
 
 import asyncio
+import contextlib
 import os
 import signal
+from collections.abc import AsyncIterator
 from typing import Any
 
 import pytest
@@ -89,12 +91,12 @@ class Listener(hf.Actor):
         self._repaired.set_result(None)
 
 
-@pytest.mark.asyncio(loop_factories=["uvloop"])
-@pytest.mark.parametrize(
-    ("isolation", "bad", "by"), [("task", Hang(), "send"), ("task", Hang(), "ask"), ("process", Spin(), "ask")], ids=str
-)
-async def test_an_actor_whose_turn_hangs_again_is_healed_by_repair(isolation: Any, bad: hf.Message, by: str) -> None:
-    spec = hf.child("node", hf.start(Node), isolation=isolation, recovery=hf.hybrid(), shutdown=0.2)
+Tended = tuple[hf.ActorSystem, hf.ActorRef[Node], "asyncio.Future[None]", diagnosis.Watch]
+
+
+@contextlib.asynccontextmanager
+async def tended(spec: hf.ChildSpec[Node]) -> AsyncIterator[Tended]:
+    """A system whose one node is repaired, and a future that ends when it has been."""
     async with hf.ActorSystem("t", log=False) as system:
         await system.start(hf.supervisor("all", children=[spec], intensity=20))
         node = system.ref("/t/all/node", Node)
@@ -102,6 +104,16 @@ async def test_an_actor_whose_turn_hangs_again_is_healed_by_repair(isolation: An
         system.spawn(hf.start(Listener, repaired))
         await node.ask(Count(), timeout=IN_TIME)
         watching = await diagnosis.watch(system, seconds=0.1, hung_after=0.5, repair="on", policy=POLICY)
+        yield system, node, repaired, watching
+
+
+@pytest.mark.asyncio(loop_factories=["uvloop"])
+@pytest.mark.parametrize(
+    ("isolation", "bad", "by"), [("task", Hang(), "send"), ("task", Hang(), "ask"), ("process", Spin(), "ask")], ids=str
+)
+async def test_an_actor_whose_turn_hangs_again_is_healed_by_repair(isolation: Any, bad: hf.Message, by: str) -> None:
+    spec = hf.child("node", hf.start(Node), isolation=isolation, recovery=hf.hybrid(), shutdown=0.2)
+    async with tended(spec) as (system, node, repaired, watching):
         asked: list[asyncio.Future[Any]] = []
         if by == "ask":  # That asks of it run out is one more symptom, which has to go.
             asked = [node.ask(bad, timeout=IN_TIME), *(node.ask(Count(), timeout=1.0) for _ in range(2))]
@@ -123,13 +135,7 @@ async def test_an_actor_whose_turn_hangs_again_is_healed_by_repair(isolation: An
 @pytest.mark.parametrize("recovery", [None, hf.hybrid()], ids=["plain", "recorded"])
 async def test_who_hears_nothing_is_not_given_the_time_to_end(recovery: Any) -> None:
     spec = hf.child("node", hf.start(Node), isolation="process", recovery=recovery, shutdown=30.0)
-    async with hf.ActorSystem("t", log=False) as system:
-        await system.start(hf.supervisor("all", children=[spec], intensity=20))
-        node = system.ref("/t/all/node", Node)
-        repaired = asyncio.get_running_loop().create_future()
-        system.spawn(hf.start(Listener, repaired))
-        await node.ask(Count(), timeout=IN_TIME)
-        await diagnosis.watch(system, seconds=0.1, hung_after=0.5, repair="on", policy=POLICY)
+    async with tended(spec) as (system, node, repaired, _):
         with system.events() as stream:
             os.kill(system.pid_of(node), signal.SIGSTOP)
             async with asyncio.timeout(IN_TIME):
