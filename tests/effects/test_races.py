@@ -15,6 +15,7 @@ import pytest
 import holdfast as hf
 from holdfast.checkpoint.home.input_ledger import InputLedger, outcome_entry
 from holdfast.checkpoint.home.recorded_home import switch_of
+from holdfast.checkpoint.home.switch import Switch
 from holdfast.checkpoint.protocol import AT_ITS_END, MESSAGE, REPLY, Answer, Came, GivenUp, Out, came
 from holdfast.ftm import LFR, PBR, TR
 from tests.effects.clerk import IN_TIME, words
@@ -194,16 +195,22 @@ async def test_a_turn_that_goes_another_way_is_not_waited_for(tmp_path: Path, mo
                         return
 
 
+async def racing(system: hf.ActorSystem, world: Path) -> tuple[hf.ActorRef[Any], Any, Switch]:
+    """A racer in the middle of its race, its answer, and its home."""
+    ref = await system.start(racer())
+    asked = ref.ask(Race(str(world)), IN_TIME)
+    await begun(world, "paid")
+    await until(system, 1)
+    home = switch_of(system._node.cell_at(PATH))
+    assert home is not None
+    return ref, asked, home
+
+
 async def test_what_comes_at_once_is_heard_one_after_another(tmp_path: Path) -> None:
     """The handler has given up the other one when that comes: the message is not lost with it."""
     world = str(tmp_path)
     async with running(tmp_path) as system:
-        ref = await system.start(racer())
-        asked = ref.ask(Race(world), IN_TIME)
-        await begun(tmp_path, "paid")
-        await until(system, 1)
-        home = switch_of(system._node.cell_at(PATH))
-        assert home is not None
+        ref, asked, home = await racing(system, tmp_path)
         tell, told = home.calls._tell, list[tuple[int, str]]()
 
         def together(turn: int, k: int, answer: Any) -> None:
@@ -230,12 +237,7 @@ async def test_a_message_that_is_taken_as_its_wait_is_given_up_comes_behind_what
     """Also behind later ones of the same sender: of the order of messages this is the exception."""
     world = str(tmp_path)
     async with running(tmp_path) as system:
-        ref = await system.start(racer())
-        asked = ref.ask(Race(world), IN_TIME)
-        await begun(tmp_path, "paid")
-        await until(system, 1)
-        home = switch_of(system._node.cell_at(PATH))
-        assert home is not None
+        ref, asked, home = await racing(system, tmp_path)
         tell = home.calls._tell
 
         def together(turn: int, k: int, answer: Any) -> None:

@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 import os
 import signal
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator
 from typing import Any
 
 import pytest
@@ -91,11 +91,11 @@ class Listener(hf.Actor):
         self._repaired.set_result(None)
 
 
-Tended = tuple[hf.ActorSystem, hf.ActorRef[Node], "asyncio.Future[None]", diagnosis.Watch]
+Tended = tuple[hf.ActorSystem, hf.ActorRef[Node], "asyncio.Future[Any]", diagnosis.Watch]
 
 
 @contextlib.asynccontextmanager
-async def tended(spec: hf.ChildSpec[Node]) -> AsyncIterator[Tended]:
+async def tended(spec: hf.ChildSpec[Node]) -> AsyncGenerator[Tended, None]:
     """A system whose one node is repaired, and a future that ends when it has been."""
     async with hf.ActorSystem("t", log=False) as system:
         await system.start(hf.supervisor("all", children=[spec], intensity=20))
