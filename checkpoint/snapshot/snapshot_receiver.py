@@ -52,6 +52,8 @@ class SnapshotReceiver:
         self._is_ahead = False
         state = b"".join(self._pieces)
         self._pieces.clear()
+        if record.turn < home.ledger.state_turn and not record.is_replaced:
+            return  # A later one is here.
         try:
             cut(home, state, record)
         except HoldfastError as error:

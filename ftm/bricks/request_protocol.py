@@ -108,6 +108,7 @@ class RequestProtocol(Transfer):
         self._lock = asyncio.Lock()
         self._marker: int | None = None  # what the last leader gave us to compute is over when this comes back
         self._least = -1  # the turn after which we go on, if those up to it have left nothing here
+        self._known = -1  # the last turn that home knew of when we were to lead
         self._wanted: int | None = None  # part of Proceed that waits, meanwhile, for home to have all before it
         self._told = math.inf  # the last turn that home knows of, until it has been told all that we know
         self._later: list[Any] = []  # what goes home behind that, and of a follower what it would have to say
@@ -239,8 +240,10 @@ class RequestProtocol(Transfer):
         self._behind_turn = max(self._behind_turn, done.behind)
         if done.number == self._marker:
             self._marker = self._wanted = None
-            if self._standing.server.turn < self._least:
-                self._standing.server.skip_to(self._least)
+            server = self._standing.server
+            if server.turn < self._least:
+                server.skip_to(self._least)
+            server.tell_of_hooks(self._known)
         elif done.wait:
             self._flush_known(done.part)
 
@@ -349,7 +352,7 @@ class RequestProtocol(Transfer):
         standing.following.ready()
         # What the last leader gave us to compute ends first: only then is it known what is a duplicate.
         self._current = self._marker = marker = marker_of(epoch)
-        self._least, self._told = order.turn, order.known
+        self._least, self._told, self._known = order.turn, order.known, order.known
         if not standing.leads:
             self._later = [one for one in self._later if is_still_due(one, order.known)]
             if server.life is None and server.turn >= 0:  # What has led to our state has begun its work elsewhere.

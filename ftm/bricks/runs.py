@@ -335,7 +335,7 @@ class Deciding(After):
         asked = [as_it_came(inputs.get(one.feed.id), one) for one in asked]
         requests = [one if one.feed.id in dropped else without_deadline(one) for one in asked]
         first = self._last_run(done.ends)
-        server.traces.objections = {}
+        server.forget_objections()
         found = await self.choose(before, requests, first)
         if found is first:
             return done

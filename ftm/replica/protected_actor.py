@@ -318,7 +318,7 @@ class Server(lifecycle.HerePlace):
         first: list[Item] = [BeginAgain(life, "on_start")] if is_lost and greets else []
         last: list[Item] = []
         if is_lost or (point is not None and point.live):
-            last.append(GoLive(life, Go(has_state, life.turn)))
+            last.append(GoLive(life, Go(has_state and not self.attempts.is_undone, life.turn)))
         if greets or tail or last:
             await self._begun(life, tail, first, last)
         return life
@@ -638,15 +638,20 @@ class Server(lifecycle.HerePlace):
                 part.leave_out(self.traces.taken)
             if not pending:
                 break
+            if pending[0].feed.id in attempts.owed and not self.only_computes:
+                if part.begun:
+                    break  # What came before it has happened, and its failure comes behind that.
+                await self._fall_to(pending[0])
             is_new = self.life is None
-            if self.only_computes:  # Hooks have counted in the first run, if they have.
+            if self.only_computes or attempts.is_undone:  # Hooks have counted in the first run, if they have.
                 await self.ensure_as_given()
             else:
                 await self.ensure()
+            attempts.is_undone = False
             if self.life is None:  # It was dropped again: another state is put here.
                 part.give_up()
                 break
-            brings = is_new and self.reports.is_snapshot_wanted and not state.is_again
+            brings = is_new and not state.is_again and (self.reports.is_snapshot_wanted or self.has_returned)
             if brings and pending[0].feed.id not in attempts.skips:
                 break  # What its hooks have left goes home before anything that stands on it.
             if brings:  # What has failed ends by itself, and all that is said of the last life stands behind its end.
@@ -671,11 +676,27 @@ class Server(lifecycle.HerePlace):
                 if pending and self.life is None and not self._goes_on([], self._rest.missed or ENDED):
                     break  # It has ended between two turns, and with it what the first ones have left.
             elif why is UNDONE:
+                attempts.is_undone = True
                 self._take_back()
             elif not self._goes_on(chunk, why):
                 break
         ends, part.ends = part.ends, []
         return ends
+
+    async def _fall_to(self, request: Request) -> None:
+        """End the life in which a request has come to its turn again that has failed: the next one recovers from that.
+
+        What its hooks do stands behind all that was handled before the failure, wherever the part has begun.
+        """
+        self.attempts.owed.discard(request.feed.id)
+        if request.feed.id in self.attempts.skips:
+            async with self._beginning:  # Whoever wants a life meanwhile has the next one.
+                await self.drop_life()
+
+    def forget_objections(self) -> None:
+        """What hooks have against requests is known to whoever decides; a failure that is still to come is not."""
+        found, owed = self.traces.objections, self.attempts.owed
+        self.traces.objections = {number: why for number, why in found.items() if number in owed}
 
     async def _run_part_again(self, pending: deque[Request], *, single: bool) -> list[TurnEnd]:
         """Nothing of the last part has happened: run it, and no more, again. `single`: one request at a time."""
@@ -715,6 +736,9 @@ class Server(lifecycle.HerePlace):
             attempts.crashes = 0
             attempts.skips[failed] = part.ends[-1]
         if then is REWIND:
+            if failed is not None and failed != part.begun[0].feed.id and not self.only_computes:
+                attempts.owed.add(failed)
+                attempts.is_undone = True
             self._take_back()
             return True
         known = {end.id for end in part.ends}
@@ -748,6 +772,8 @@ class Server(lifecycle.HerePlace):
                     raise  # What `on_start` has left, and no turn.
                 if len(begun) == 1 and self.life is not None and self.life.cell.actor is not None:
                     self._fail(begun[0], ends[-1], error)
+                # Under replay what `on_start` has done stands before the part, and may be what cannot be saved.
+                self.attempts.is_undone = len(begun) > 1 and self.life is not None and self.life.is_live
                 await self.drop_life()
                 ends = await self._run_part_again(pending, single=len(begun) > 1)
             else:
@@ -763,7 +789,7 @@ class Server(lifecycle.HerePlace):
         life, points = self.life, self.points
         begun, self.part.begun = self.part.begun, []
         if begun:  # Else those that have failed are still to be told.
-            self.attempts.skips.clear()
+            self.attempts.skips = self.attempts.still_owed()
         if self.state.is_over:
             return
         if life is None:
@@ -965,7 +991,7 @@ class Server(lifecycle.HerePlace):
         Nothing is handed over. Asks get the outcomes that they had.
         """
         previous = self.points.previous
-        self.traces.objections.clear()
+        self.forget_objections()
         await self._go_back_to(before)
         self.traces.withheld = []
         self.state.is_again = True
@@ -974,7 +1000,8 @@ class Server(lifecycle.HerePlace):
         finally:
             self.state.is_again = False
         await self.ensure_as_given()
-        skips, self.attempts.skips = self.attempts.skips, {}
+        owed = self.attempts.still_owed()
+        skips, self.attempts.skips = len(self.attempts.skips) - len(owed), owed
         try:
             self.capture()
         except BaseException as error:  # What the user's own values and methods raise: as when a part is sealed.
@@ -1061,6 +1088,14 @@ class Server(lifecycle.HerePlace):
         """Save the state for home, if it wants that; only when it is decided that this is the state."""
         if self.reports.is_snapshot_wanted:
             self._take_snapshot()
+
+    def tell_of_hooks(self, turn: int) -> None:
+        """To a home that has all turns up to this one: hooks have changed the state here, and no replay leads to that.
+
+        The last leader has told it of its own, if it has come to that: a failure may be known here alone.
+        """
+        if self.points.untraced >= max(turn - 1, 0):
+            self.want_snapshot()
 
     def want_snapshot(self) -> None:
         """A snapshot goes home behind the part in hand, or at once."""

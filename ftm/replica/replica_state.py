@@ -99,6 +99,12 @@ class Attempts:
     crashed: float = 0.0  # when it last has, by the loop's clock
     failed: int | None = None  # the request whose turn has failed, and with it the life
     skips: dict[int, TurnEnd] = dataclasses.field(default_factory=dict)  # requests that fail without being run
+    owed: set[int] = dataclasses.field(default_factory=set)  # those whose failure ends the life that comes to them
+    is_undone: bool = False  # no crash has ended the last life: the next one does not recover, it goes on
+
+    def still_owed(self) -> dict[int, TurnEnd]:
+        """How those requests fail whose failure is still to come."""
+        return {number: end for number, end in self.skips.items() if number in self.owed}
 
 
 @dataclasses.dataclass(slots=True)
@@ -194,7 +200,7 @@ def next_requests(
         return [pending.popleft()]
     chunk = [pending.popleft()]
     while pending and len(chunk) < attempts.size:
-        if runs_alone(state, pending[0].feed, leads=leads, has_work=has_work):
+        if pending[0].feed.id in attempts.owed or runs_alone(state, pending[0].feed, leads=leads, has_work=has_work):
             break
         chunk.append(pending.popleft())
     return chunk

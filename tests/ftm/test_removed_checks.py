@@ -14,6 +14,7 @@ SUBTREE, STATE = "tests/ftm/test_subtree.py", "tests/ftm/test_group_state.py"
 PUT_BACK, UNAWAITED = "tests/ftm/test_put_back.py", "tests/ftm/test_unawaited_asks.py"
 SPOILED = "tests/ftm/test_spoiled_states.py"
 RANDOM_HOOKS = "tests/ftm/test_random_hooks.py"
+IN_A_BATCH = "tests/ftm/test_failure_in_a_batch.py"
 FAILOVER, CHECKS_ALONE = "tests/ftm/test_failover.py", "tests/ftm/test_checks.py"
 AUTHORS = "tests/ftm/test_author_bricks.py"
 REVOKED, LINKS = "tests/ftm/test_revoked_replicas.py", "tests/ftm/sec/test_link.py"
@@ -349,10 +350,45 @@ CHECKS = {
     ),
     "what is computed again has no hooks that count": Check(
         "ftm/replica/protected_actor.py",
-        "            if self.only_computes:  # Hooks",
+        "            if self.only_computes or attempts.is_undone:  # Hooks",
         "            if False:  # Hooks",
         RANDOM_HOOKS,
         "test_what_is_acknowledged and stays",
+    ),
+    "what hooks do for a failure stands behind all that came before it": Check(
+        "ftm/replica/protected_actor.py",
+        "                attempts.owed.add(failed)\n                attempts.is_undone = True\n",
+        "                pass\n",
+        IN_A_BATCH,
+        "test_what_hooks_do and hybrid-lfr",
+    ),
+    "a life that begins again to go on has recovered from nothing": Check(
+        "ftm/replica/protected_actor.py",
+        "Go(has_state and not self.attempts.is_undone, life.turn)",
+        "Go(has_state, life.turn)",
+        IN_A_BATCH,
+        "test_a_life_recovers_once",
+    ),
+    "what is held against a request whose failure is still to come is not forgotten": Check(
+        "ftm/replica/protected_actor.py",
+        "        self.traces.objections = {number: why for number, why in found.items() if number in owed}\n",
+        "        self.traces.objections = {}\n",
+        PUT_BACK,
+        "rb and put_back_by_blocks",
+    ),
+    "whoever leads now saves what hooks have done that home may not know": Check(
+        "ftm/bricks/request_protocol.py",
+        "            server.tell_of_hooks(self._known)\n",
+        "            pass\n",
+        IN_A_BATCH,
+        "test_a_failure_that_the_follower",
+    ),
+    "a snapshot that comes behind a later one is not kept": Check(
+        "checkpoint/snapshot/snapshot_receiver.py",
+        "        if record.turn < home.ledger.state_turn and not record.is_replaced:\n            return  # A later",
+        "        if False:\n            return  # A later",
+        IN_A_BATCH,
+        "test_a_snapshot_that_comes",
     ),
     "what was put back at a point, and handled since, is not handled again": Check(
         "ftm/replica/protected_actor.py",
@@ -377,7 +413,7 @@ CHECKS = {
     ),
     "what hooks have left is at home before what stands on it": Check(
         "ftm/replica/protected_actor.py",
-        "brings = is_new and self.reports.is_snapshot_wanted and not state.is_again\n",
+        "brings = is_new and not state.is_again and (self.reports.is_snapshot_wanted or self.has_returned)\n",
         "brings = False\n",
         "tests/checkpoint/test_hook_changes.py",
         "test_replicas_that_die_before",
