@@ -13,6 +13,8 @@ from __future__ import annotations
 import functools
 from typing import TYPE_CHECKING
 
+import msgspec
+
 from ..actors.errors import HoldfastError
 from ..actors.kernel.cell import Cell
 from ..actors.persistence import ENTRIES, entries_key
@@ -27,6 +29,8 @@ if TYPE_CHECKING:
 
 LEFT = "moved from "
 """How the note begins that an address was left; the address follows, and the note is where its actor lives now."""
+LED = "bound to "
+"""How the note begins of where an actor's bindings have led; the actor's key follows."""
 KEY = "recorded under "
 """How the note begins of an actor whose key is not its address; the address follows, and the note is the key."""
 
@@ -62,7 +66,7 @@ class Addresses:
         keys = {at.removeprefix(KEY): key.decode() for at, key in journal.notes(KEY).items()}
         self._keys = journal.keys if isinstance(journal, Called) else {}  # Of what is in memory only, nothing is read.
         self._keys.update(keys)
-        self.registered = RegisteredKeys(journal)
+        self.registered, self.led = RegisteredKeys(journal), FormerTargets(journal)
         self._watched: set[str] = set()
         for path in self._left:
             self._watch(path)
@@ -207,6 +211,7 @@ class Addresses:
         Raises:
             HoldfastError: the store refused.
         """
+        self.led.erased(self.key(path))
         self._name(path, None)
 
     def _name(self, path: str, key: str | None) -> None:
@@ -227,6 +232,46 @@ def renamed(names: Mapping[str, str], path: str) -> str:
         above, _, name = above.rpartition("/")
         below = f"/{name}{below}"
     return names[above] + below if above else path
+
+
+class FormerTargets:
+    """Where the bindings of recorded actors lead, and have led since the state that their next lives begin with.
+
+    What a turn has sent through a binding comes out of its replay for whoever the binding leads to now. The next root
+    has to know that too, whether it was bound anew while the last one worked, or the program says something else now.
+    """
+
+    def __init__(self, journal: Journal) -> None:
+        self._journal = journal
+        self._led: dict[str, dict[str, list[str]]] = {
+            key.removeprefix(LED): msgspec.msgpack.decode(value, type=dict[str, list[str]])
+            for key, value in journal.notes(LED).items()
+        }
+
+    def bound(self, key: str, targets: Mapping[str, str], *, is_saved: bool) -> None:
+        """These ports of an actor lead to these addresses now. `is_saved`: no turn that was before is handled again.
+
+        Raises:
+            HoldfastError: the store refused.
+        """
+        known, led = self._led.get(key, {}), dict[str, list[str]]()
+        for port, to in targets.items():
+            before = [] if is_saved else [one for one in known.get(port, ()) if one != to]
+            led[port] = [*before, to]
+        led = {**({} if is_saved else known), **led}
+        if led == known:
+            return
+        self._led[key] = led
+        self._journal.note(LED + key, msgspec.msgpack.encode(led))
+
+    def alike(self, key: str, to: str) -> set[str]:
+        """The addresses that a binding has led to which leads, or has led, to this one."""
+        return {one for led in self._led.get(key, {}).values() if to in led for one in led}
+
+    def erased(self, key: str) -> None:
+        """Nothing is recorded of an actor any more. Raises HoldfastError: the store refused."""
+        if self._led.pop(key, None) is not None:
+            self._journal.note(LED + key, None)
 
 
 class RegisteredKeys:

@@ -26,7 +26,7 @@ from ..errors import (
     type_name,
 )
 from ..events import DeadLetter, Event, EventHub, SupervisorGaveUp
-from ..exit_reasons import KILLED, ExitReason
+from ..exit_reasons import ExitReason
 from ..persistence import Keeper, NothingKept
 from ..values.path_parts import check_beside, check_path_part
 from . import lifecycle
@@ -226,7 +226,7 @@ class Node(RunLoop):
         )  # outlives an actor's lives
         self.remains: dict[asyncio.Future[Any], str] = {}  # what killed lives have left and is still ending: address
         self.safe: dict[str, asyncio.TimerHandle] = {}  # who is in safe state here: when that should be over
-        self.led: dict[str, dict[str, set[str]]] = {}  # of who is replayed: where bindings led, by where they lead
+        self.on_rebound = unnoticed  # where the binding of an actor led may be met again in a replay
         self.supervised = Supervised()
         self.root: Cell | None = None
         self.arbiter: Any = None  # who may act on which address, once somebody has asked for it
@@ -477,30 +477,24 @@ class Node(RunLoop):
             known = ", ".join(sorted(kind._bindings)) or "none"
             raise SpecError(cell.path, f"{type_name(kind)} has no binding {port!r} (it has: {known})")
         more = cell.extra()
-        soon = more.turn.rebinds if more.turn is not None else None
-        before = (soon or {}).get(port) or more.bindings.get(port)
-        if before is not None:
-            self._alike(cell, before.path, target.path)
         more.claimed = more.claimed | {port} if is_claimed else more.claimed - {port}
         if more.turn is None:
             more.bindings[port] = target
         else:  # One turn sees one target, also if it waits meanwhile.
             more.turn.rebinds = {**(more.turn.rebinds or {}), port: target}
+        self.on_rebound(cell, port, target.path)
         cell.host.told(cell, "bind", {"port": port, "target": target.path, "is_claimed": is_claimed})
 
-    def tell_binding(self, cell: Cell, port: str, was: str) -> None:
-        """Tell whoever lives the life at a cell that the target of a binding has left the address `was`."""
+    def tell_binding(self, cell: Cell, port: str) -> None:
+        """Tell whoever lives the life at a cell that the target of a binding has another address."""
         more = cell.extra()
         target = more.bindings[port]
-        self._alike(cell, was, target.path)
+        self.on_rebound(cell, port, target.path)
         cell.host.told(cell, "bind", {"port": port, "target": target.path, "is_claimed": port in more.claimed})
 
-    def _alike(self, cell: Cell, was: str, now: str) -> None:
-        """What was sent through a binding to one address may be sent again to the other, if turns are replayed."""
-        if was != now and cell.host.recovers(KILLED):
-            led = self.led.setdefault(cell.path, {})
-            same = {was, now, *led.get(was, ()), *led.get(now, ())}
-            led.update(dict.fromkeys(same, same))
+
+def unnoticed(cell: Cell, port: str, target: str) -> None:
+    """Nobody keeps where bindings lead."""
 
 
 def _void() -> None:

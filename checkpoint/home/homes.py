@@ -83,6 +83,7 @@ class Homes:
         self.rejoin = Rejoin(self, bears_repetition)
         self.far = FarMail(self)
         self.erasures = Erasures(self)
+        node.on_rebound = self._rebound
 
     def of(self, cell: Cell, method: Method) -> Switch:
         """The home of an address; taken up from the store when it is first asked for.
@@ -92,9 +93,24 @@ class Homes:
         """
         switch = self.expecting(cell, method)
         self.absolve(cell.path)
+        self._led_to(switch, {port: target.path for port, target in cell.extra().bindings.items()})
         self.on_home(switch)
         self.groups.opened(switch)
         return switch
+
+    def _led_to(self, switch: Switch, targets: Mapping[str, str]) -> None:
+        if targets and switch.method.replays:
+            is_saved = switch.ledger.turn <= switch.ledger.state_turn
+            self.addresses.led.bound(self.addresses.key(switch.path), targets, is_saved=is_saved)
+
+    def _rebound(self, cell: Cell, port: str, target: str) -> None:
+        """A binding of an actor leads elsewhere now."""
+        switch = self._switches.get(cell.path)
+        if switch is not None:
+            try:
+                self._led_to(switch, {port: target})
+            except HoldfastError:
+                pass  # This root knows it; the next one has no more than the store, which takes nothing now.
 
     def expecting(self, cell: Cell, method: Method) -> Switch:
         """The home of an address where the next life is still to begin, as `of` takes it up; it holds what comes.

@@ -119,8 +119,9 @@ def is_as_before(home: Switch, out: Out, digest: int) -> bool:
     Its binding leads elsewhere now, its receiver has moved, or its class has other fields, or another name. It is taken
     for the same if its class has lost a field, or one has another type: how it was coded cannot be known then.
     """
-    led = home.node.led.get(home.path, {}).get(out.to, ())
-    receivers = (out.to, *led, *home.homes.addresses.known_as(out.to))
+    addresses = home.homes.addresses
+    led = addresses.led.alike(addresses.key(home.path), out.to)
+    receivers = (out.to, *led, *addresses.known_as(out.to))
 
     def is_same(name: str, body: bytes) -> bool:
         made = (msgspec.structs.replace(out, to=to, name=name, body=body).digest() for to in receivers)

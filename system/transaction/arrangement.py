@@ -232,9 +232,8 @@ def tell_bindings(root: Cell | None, was: dict[str, str]) -> None:
     """Have processes bind their actors to those that have moved by the addresses that these have now."""
     for cell in every_cell(root):
         for port, target in (cell.more.bindings if cell.more is not None else {}).items():
-            old = renamed(was, target.path)
-            if old != target.path:
-                cell.node.tell_binding(cell, port, old)
+            if renamed(was, target.path) != target.path:
+                cell.node.tell_binding(cell, port)
 
 
 def planned_spec(place: DraftPlace, *, in_force: bool) -> ChildSpec:

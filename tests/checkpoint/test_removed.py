@@ -12,6 +12,7 @@ LARGE = "tests/checkpoint/test_large_states.py"
 CHUNKS = "tests/checkpoint/test_chunks.py"
 CHUNKS_KEPT = "tests/checkpoint/test_chunks_kept.py"
 
+FINDING = "tests/checkpoint/test_finding.py"
 KILLS = "tests/checkpoint/test_kill_counts.py"
 
 RACES = "tests/effects/test_races.py"
@@ -32,6 +33,27 @@ GIVEN_UP = "tests/checkpoint/test_given_up.py"
 WITHDRAWN = "tests/checkpoint/test_withdrawn.py"
 
 CHECKS = {
+    "where a binding leads when a life begins is known to the next program": Check(
+        "checkpoint/home/homes.py",
+        "        self._led_to(switch, {port: target.path for port, target in cell.extra().bindings.items()})\n",
+        "",
+        FINDING,
+        "met_by_no_turn_before",
+    ),
+    "where a binding has led in between is known to the next program": Check(
+        "checkpoint/home/homes.py",
+        "        node.on_rebound = self._rebound\n",
+        "",
+        FINDING,
+        "transactions_have_changed",
+    ),
+    "where a binding led before a snapshot is forgotten": Check(
+        "checkpoint/home/homes.py",
+        "            is_saved = switch.ledger.turn <= switch.ledger.state_turn\n",
+        "            is_saved = False\n",
+        FINDING,
+        "before_a_snapshot",
+    ),
     "who is told that it was not handled is told behind the store": Check(
         "checkpoint/home/admission.py",
         "        home.journal.submit(Withdrawal(home, source, then))\n",
@@ -216,7 +238,7 @@ CHECKS = {
     ),
     "a replay knows a receiver by all its addresses": Check(
         "checkpoint/home/replay.py",
-        "(out.to, *led, *home.homes.addresses.known_as(out.to))",
+        "(out.to, *led, *addresses.known_as(out.to))",
         "(out.to, *led)",
         ORDER,
         "each_address and tell-receiver-after",

@@ -60,6 +60,18 @@ class Porch(Room):
         (Path(message.folder) / str(os.getpid())).touch()
 
 
+class Consult(hf.Message[int]):
+    """A turn that asks somebody else, and waits for that."""
+
+    whom: hf.ActorRef[Any]
+
+
+class Asking(Porch):
+    @hf.on(Consult)
+    async def consult(self, message: Consult) -> int:
+        return len(await message.whom.ask(Entered(), IN_TIME))
+
+
 class Telling(Porch):
     """Writes down, for each process, that it has recovered."""
 
@@ -128,6 +140,17 @@ async def test_a_life_recovers_once_from_a_failure(name: str, tmp_path: Path) ->
         before = file.read_text()
         await said(ref, [Enter(0), Enter(1), Mark(str(tmp_path)), Fail(), Returns()])
         assert file.read_text() == before + "recovered\n"
+
+
+@pytest.mark.parametrize("name", sorted(set(mechanisms()) - {"none"}))
+async def test_a_turn_that_waits_in_the_middle_of_a_batch_is_no_failure(name: str) -> None:
+    """What came before it may be run again for it, in a life that recovers from nothing."""
+    async with hf.ActorSystem("app", log=False, intensity=100_000) as system:
+        other = await system.start(hf.child("other", hf.start(Room)))
+        ref = await system.start(hf.child("porch", hf.start(Asking), mechanism=mechanisms()[name]))
+        await two_again(ref)
+        burst = [Enter(0), Enter(1), Close(), Consult(other), Enter(2), Consult(other), Returns()]
+        assert await said(ref, burst) == [1, 2, None, 0, 3, 0, (0, False)]
 
 
 async def test_a_failure_that_the_follower_alone_has_come_to_is_recorded_with_what_its_hooks_did(

@@ -369,6 +369,13 @@ CHECKS = {
         IN_A_BATCH,
         "test_a_life_recovers_once",
     ),
+    "a turn that has waited in the middle of a part is no failure": Check(
+        "ftm/replica/protected_actor.py",
+        "                attempts.is_undone = True\n                self._take_back()\n            elif",
+        "                self._take_back()\n            elif",
+        IN_A_BATCH,
+        "test_a_turn_that_waits",
+    ),
     "what is held against a request whose failure is still to come is not forgotten": Check(
         "ftm/replica/protected_actor.py",
         "        self.traces.objections = {number: why for number, why in found.items() if number in owed}\n",
