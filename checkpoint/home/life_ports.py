@@ -10,9 +10,10 @@ import msgspec
 from ...actors.kernel.cell import ORDERS
 from ...actors.process.wire import frames
 from ...actors.process.wire.frames import BadFrame
-from ..protocol import Hooked, Released, Snapshot, ToHome, ToLife, TurnEnd, Wanted
+from ..protocol import Hooked, Out, Released, Snapshot, ToHome, ToLife, TurnEnd, Wanted
 
 if TYPE_CHECKING:
+    from ...actors.process.wire.worker_gate import WorkerGate
     from ...actors.process.worker_pool import Worker
     from ..inputs import Input
     from .switch import Switch
@@ -38,11 +39,7 @@ def records_of(worker: Worker, take: Callable[[ToHome], None]) -> frames.TakeRec
     def taken(frame: frames.Record) -> None:
         record = decode(frame.body)
         if isinstance(record, (TurnEnd, Released, Hooked)):
-            for out in [record.out] if isinstance(record, Hooked) else record.outs:
-                if out.verb in SENT:
-                    gate.output(out.to, out.name)
-                elif out.verb in ORDERS:
-                    gate.order(out.to, out.verb)
+            require_outputs(gate, record)
         elif isinstance(record, Wanted):
             gate.claims(record.bindings)
             if record.register is not None:
@@ -54,6 +51,26 @@ def records_of(worker: Worker, take: Callable[[ToHome], None]) -> frames.TakeRec
         take(record)
 
     return taken
+
+
+def outputs_of(record: object) -> list[Out]:
+    """What a record of a life lets out."""
+    if isinstance(record, Hooked):
+        return [record.out]
+    return record.outs if isinstance(record, (TurnEnd, Released)) else []
+
+
+def require_outputs(gate: WorkerGate, record: object) -> None:
+    """See whether a process may let all of this out.
+
+    Raises:
+        BadFrame: it may not.
+    """
+    for out in outputs_of(record):
+        if out.verb in SENT:
+            gate.output(out.to, out.name)
+        elif out.verb in ORDERS:
+            gate.order(out.to, out.verb)
 
 
 class RemoteLife:

@@ -6,7 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 from ...actors.kernel.actor import Actor, on
 from ...actors.kernel.bindings import Binding
+from ...actors.kernel.cell import ORDERS
 from ...actors.kernel.message import Message, message_name
+from ...actors.process.wire.frames import BadFrame
+from ...actors.process.wire.worker_gate import is_order
+from ...checkpoint.home.life_ports import outputs_of, require_outputs
 from ..bricks.brick_messages import Done, Outward
 from ..bricks.replica_orders import Stalled
 from ..bricks.sealed_frames import Agree, Back, Call, Greet, Refused, Sealed
@@ -22,6 +26,10 @@ if TYPE_CHECKING:
 Said = Done | Outward | Stalled
 """What replicas say to it."""
 SAID: dict[str, type[Said]] = {message_name(kind): kind for kind in (Done, Outward, Stalled)}
+
+
+def _records(message: Done | Outward) -> list[Any]:
+    return [*message.ends, *message.more] if isinstance(message, Done) else list(message.records)
 
 
 class TakeAll(Message[None]):
@@ -74,7 +82,29 @@ class Proxy(GroupPart):
             else:
                 self._group.delivery.stale += 1
 
+    def _may_leave(self, message: Said) -> bool:
+        """Whether the leader's process may let all of this out; one that may not is ended, and has said nothing.
+
+        What has come from one that is gone is as good as not said, if it orders somebody: the next one is asked again.
+        """
+        records = () if isinstance(message, Stalled) else _records(message)
+        if not any(map(outputs_of, records)):
+            return True
+        primary = self._group.membership.primary
+        worker = None if primary is None else self._group.replicas.worker_of(primary)
+        if worker is None:
+            return not any(out.verb in ORDERS or is_order(out.name) for one in records for out in outputs_of(one))
+        try:
+            for record in records:
+                require_outputs(worker.gate, record)
+        except BadFrame as error:
+            worker.breach(error.problem)
+            return False
+        return True
+
     def _hear(self, message: Said) -> None:
+        if not self._may_leave(message):
+            return
         match message:
             case Done():
                 self._group.take_done(message)

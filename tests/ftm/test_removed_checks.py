@@ -13,12 +13,27 @@ PBR, LFR, SEC = "tests/ftm/test_pbr.py", "tests/ftm/test_lfr.py", "tests/ftm/tes
 SUBTREE, STATE = "tests/ftm/test_subtree.py", "tests/ftm/test_group_state.py"
 PUT_BACK, UNAWAITED = "tests/ftm/test_put_back.py", "tests/ftm/test_unawaited_asks.py"
 SPOILED = "tests/ftm/test_spoiled_states.py"
+HOSTILE = "tests/ftm/test_hostile_replicas.py"
 RANDOM_HOOKS = "tests/ftm/test_random_hooks.py"
 IN_A_BATCH = "tests/ftm/test_failure_in_a_batch.py"
 FAILOVER, CHECKS_ALONE = "tests/ftm/test_failover.py", "tests/ftm/test_checks.py"
 AUTHORS = "tests/ftm/test_author_bricks.py"
 REVOKED, LINKS = "tests/ftm/test_revoked_replicas.py", "tests/ftm/sec/test_link.py"
 CHECKS = {
+    "what a leader lets out is looked at as what any process lets out": Check(
+        "ftm/group/proxy.py",
+        "        if not self._may_leave(message):\n",
+        "        if False:\n",
+        HOSTILE,
+        "test_the_order_of_a_leader and kill and pbr",
+    ),
+    "what a leader that is gone has ordered is as good as not said": Check(
+        "ftm/group/proxy.py",
+        "        if worker is None:\n",
+        "        if worker is None:\n            return True\n        if worker is None:\n",
+        HOSTILE,
+        "test_what_a_leader_that_is_gone",
+    ),
     "a group whose life has gone elsewhere is no start that has failed": Check(
         "ftm/group/group_place.py",
         "            if cell.host.place is not self:\n                return",

@@ -13,8 +13,8 @@ GATE = "actors/process/wire/worker_gate.py"
 CHECKS = {
     "a recorded actor in a process orders whom it may": Check(
         "checkpoint/home/life_ports.py",
-        "                    gate.order(out.to, out.verb)\n",
-        "                    pass\n",
+        "            gate.order(out.to, out.verb)\n",
+        "            pass\n",
         CLAIMS,
         "test_an_order_among_the_outputs and asyncio",
     ),
