@@ -248,11 +248,17 @@ def _is_same(block: memoryview, address: int, place: Place, segment: Segment) ->
     return bytes(block) == bytes(kept)
 
 
+class BlocksGone(HoldfastError, text="the blocks of a snapshot are gone: {why}"):
+    """The life that has written them does not hold them any more."""
+
+    why: str
+
+
 def open_segment(number: int, pid: int, file: int, inode: int, *, is_lent: bool = False) -> Segment:
     """A segment that another process holds: a life that has written it, or (`is_lent`) a home that lends it.
 
     Raises:
-        HoldfastError: it is not there any more.
+        BlocksGone: it is not there any more. HoldfastError: it cannot be had.
     """
     try:
         own = os.open(f"/proc/{pid}/fd/{file}", (os.O_RDONLY if is_lent else os.O_RDWR) | os.O_CLOEXEC)
@@ -261,11 +267,13 @@ def open_segment(number: int, pid: int, file: int, inode: int, *, is_lent: bool 
         except OSError:
             os.close(own)
             raise
+    except FileNotFoundError as error:
+        raise BlocksGone(str(error)) from error
     except OSError as error:
-        raise HoldfastError(f"the blocks of a snapshot are gone: {error}") from error
+        raise HoldfastError(f"the blocks of a snapshot cannot be had: {error}") from error
     if segment.inode != inode:
         segment.close()
-        raise HoldfastError("the blocks of a snapshot are gone: its process has closed them")
+        raise BlocksGone("its process has closed them")
     return segment
 
 

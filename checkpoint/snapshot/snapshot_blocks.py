@@ -18,7 +18,7 @@ from ...actors.events import SnapshotTaken
 from ..journal import DamagedStore
 from ..protocol import PIECE, Kept, Lent, Marked, Restore, Shared, Snapshot
 from .image_parts import digest
-from .shared_blocks import Place, Segment, by_segment, new_number, open_segment
+from .shared_blocks import BlocksGone, Place, Segment, by_segment, new_number, open_segment
 from .snapshot_record import IMAGES, Meta, begin_with_older, keep, made_by, meta_now
 
 if TYPE_CHECKING:
@@ -42,6 +42,7 @@ class SnapshotImages:
         self._packs: set[int] = set()  # what the store may have
         self._marked: Meta | None = None
         self._saving: asyncio.Task[None] | None = None
+        self._is_missed = False  # the last image was gone when it was to be taken
 
     @property
     def is_saving(self) -> bool:
@@ -57,6 +58,15 @@ class SnapshotImages:
         home = self._home
         try:
             meta = self._open(record, shared)
+        except BlocksGone as error:
+            # Most likely the life has given it up, for it saves its last state in another way, or has ended.
+            if self._is_missed:
+                self.refuse(shared, str(error))
+            else:
+                self._is_missed = True
+                self._dismiss(shared)
+                home.due.missed()
+            return
         except HoldfastError as error:
             self.refuse(shared, str(error))
             return
@@ -146,6 +156,7 @@ class SnapshotImages:
             self._let_go(number)
         if home.life.port is not None:
             home.life.port.to_life(Kept(shared.number, True, is_full, digests))
+        self._is_missed = False
         home.limit.cut()
         home.due.kept(meta.turn)
         if home.node.events.has_listeners:
@@ -155,12 +166,14 @@ class SnapshotImages:
 
     def refuse(self, shared: Shared, why: str) -> None:
         """It could not be kept: what was there before is still there."""
-        home = self._home
+        self._dismiss(shared)
+        self._home.due.failed(why)
+
+    def _dismiss(self, shared: Shared) -> None:
         self._let_go(shared.number)
         self._sizes.pop(shared.number, None)
-        if home.life.port is not None:
-            home.life.port.to_life(Kept(shared.number, False))
-        home.due.failed(why)
+        if self._home.life.port is not None:
+            self._home.life.port.to_life(Kept(shared.number, False))
 
     def earlier(self) -> list[int]:
         """The packs that the older snapshots need."""
@@ -169,7 +182,7 @@ class SnapshotImages:
 
     def cancel(self) -> None:
         """What is not finished will not count."""
-        self._saving = None
+        self._saving, self._is_missed = None, False
         self._marked = None
 
     def tidy(self) -> None:

@@ -100,6 +100,12 @@ class SnapshotSchedule:
         if not home.homes.journal.engine.has_failed():  # What has ended the store tells more.
             home.node.emit(SnapshotFailed(home.path, why))
 
+    def missed(self) -> None:
+        """What was asked for was given up by the life: another one is on its way, or is asked for after a while."""
+        self.asked_at = -1.0
+        self.not_before = self._home.node.loop.time() + FIRST_RETRY
+        self.on_want(self._home)
+
     def restarted(self) -> None:
         """Another life begins: what was asked of the last one will not come."""
         self.asked_at = -1.0

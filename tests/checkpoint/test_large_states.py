@@ -20,7 +20,7 @@ import holdfast
 import holdfast as hf
 from holdfast.actors.errors import HoldfastError, NoSuchActor
 from holdfast.actors.values import ByteParts, adopt_value, encode_value, in_one, walked_pieces
-from holdfast.checkpoint.protocol import Lent
+from holdfast.checkpoint.protocol import Lent, Shared, Snapshot
 from holdfast.checkpoint.snapshot.mapped_image import map_image
 from holdfast.checkpoint.snapshot.shared_blocks import BLOCK, PAGE, Segment
 from tests.checkpoint.image_player import CELLS, MANY, Canvas, Digest, Paint, Spoil, Turns, digest_of
@@ -121,6 +121,26 @@ async def test_what_comes_back_unchanged_is_not_written_again(store: str | None,
             assert taken.written_bytes <= 3 * BLOCK, f"life {number}"
         end(system, ref)
         assert await ref.ask(Digest(), timeout=25.0) == digest_of(want)
+
+
+async def test_an_image_that_its_life_has_given_up_is_no_failure_but_a_second_one_is(tmp_path: Path) -> None:
+    """A stop in good order saves the state in another way, and closes what was under way."""
+    async with hf.ActorSystem("app", store=f"sqlite:{tmp_path / 'app.db'}", log=False) as system:
+        ref = await canvas(system, "process", CELLS)
+        await system.checkpoint(ref, timeout=25.0)
+        home = system._homes.at(ref.path)
+        assert home is not None
+        closed = Shared(number=1 << 40, pid=system.pid_of(ref), file=1 << 20, inode=1, size=BLOCK, places=[])
+        with system.events() as stream:
+
+            def failed() -> list[str]:
+                return [one.reason for one in stream.take() if isinstance(one, hf.events.SnapshotFailed)]
+
+            home.images.take(Snapshot(0, b"", True, [], 0.0), closed)
+            assert failed() == []
+            home.images.take(Snapshot(0, b"", True, [], 0.0), closed)
+            assert ["gone" in one for one in failed()] == [True]
+        await system.checkpoint(ref, timeout=25.0)
 
 
 async def test_two_come_back_at_once(store: str | None) -> None:

@@ -33,6 +33,20 @@ GIVEN_UP = "tests/checkpoint/test_given_up.py"
 WITHDRAWN = "tests/checkpoint/test_withdrawn.py"
 
 CHECKS = {
+    "an image that its life has given up is no failure": Check(
+        "checkpoint/snapshot/snapshot_blocks.py",
+        "            if self._is_missed:\n",
+        "            if True:\n",
+        LARGE,
+        "given_up_is_no_failure",
+    ),
+    "an image that is gone each time is a failure": Check(
+        "checkpoint/snapshot/snapshot_blocks.py",
+        "                self._is_missed = True\n",
+        "                self._is_missed = False\n",
+        LARGE,
+        "given_up_is_no_failure",
+    ),
     "where a binding leads when a life begins is known to the next program": Check(
         "checkpoint/home/homes.py",
         "        self._led_to(switch, {port: target.path for port, target in cell.extra().bindings.items()})\n",
