@@ -35,8 +35,9 @@ campaign: $(VENV)/.dev
 	HOLDFAST_EFFECTS=10000 HOLDFAST_RACES=1000 HOLDFAST_WAITS=300 $(BIN)/python -m pytest -q -n 2 -s -o faulthandler_timeout=900 \
 	    tests/effects/test_campaign.py tests/effects/test_race_programs.py tests/effects/test_waits_under_mechanisms.py
 	HOLDFAST_ROOTS=1000 $(BIN)/python -m pytest -q -s -o faulthandler_timeout=0 tests/system/test_specification_kills.py
-	HOLDFAST_REQUESTS=10000 HOLDFAST_STRIKES=2000 HOLDFAST_SOAK=60 HOLDFAST_REMOVED=1 $(BIN)/python -m pytest -q -n 2 -s \
-	    tests/ftm/test_campaign_faults.py tests/ftm/test_campaign.py tests/ftm/test_soak.py tests/ftm/test_removed_checks.py
+	HOLDFAST_REQUESTS=10000 HOLDFAST_STRIKES=2000 HOLDFAST_PROGRAMS=300 HOLDFAST_SOAK=60 HOLDFAST_REMOVED=1 \
+	    $(BIN)/python -m pytest -q -n 2 -s tests/ftm/test_campaign_faults.py tests/ftm/test_campaign.py \
+	    tests/ftm/test_random_hooks.py tests/ftm/test_soak.py tests/ftm/test_removed_checks.py
 	HOLDFAST_MATRIX=1700 HOLDFAST_LOADED_MOVES=50 HOLDFAST_BAD_CHANGES=1 $(BIN)/python -m pytest -q -n 2 -s \
 	    -o faulthandler_timeout=900 tests/migration tests/system/test_moves_under_load.py tests/ftm/test_bad_changes.py
 	HOLDFAST_TRANSACTIONS=1000 $(BIN)/python -m pytest -q -n 2 -s -o faulthandler_timeout=0 \

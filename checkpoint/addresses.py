@@ -31,6 +31,8 @@ LEFT = "moved from "
 """How the note begins that an address was left; the address follows, and the note is where its actor lives now."""
 LED = "bound to "
 """How the note begins of where an actor's bindings have led; the actor's key follows."""
+FORMER = 16
+"""Addresses that a binding led to before the last snapshot that are remembered."""
 KEY = "recorded under "
 """How the note begins of an actor whose key is not its address; the address follows, and the note is the key."""
 
@@ -235,7 +237,7 @@ def renamed(names: Mapping[str, str], path: str) -> str:
 
 
 class FormerTargets:
-    """Where the bindings of recorded actors lead, and have led since the state that their next lives begin with.
+    """Where the bindings of recorded actors lead, and have led: all since the last snapshot, and a few before it.
 
     What a turn has sent through a binding comes out of its replay for whoever the binding leads to now. The next root
     has to know that too, whether it was bound anew while the last one worked, or the program says something else now.
@@ -249,16 +251,18 @@ class FormerTargets:
         }
 
     def bound(self, key: str, targets: Mapping[str, str], *, is_saved: bool) -> None:
-        """These ports of an actor lead to these addresses now. `is_saved`: no turn that was before is handled again.
+        """These ports of an actor lead to these addresses now.
+
+        `is_saved`: no turn that was before is handled again, but from an older snapshot, if the newest is damaged.
 
         Raises:
             HoldfastError: the store refused.
         """
         known, led = self._led.get(key, {}), dict[str, list[str]]()
         for port, to in targets.items():
-            before = [] if is_saved else [one for one in known.get(port, ()) if one != to]
-            led[port] = [*before, to]
-        led = {**({} if is_saved else known), **led}
+            before = [one for one in known.get(port, ()) if one != to]
+            led[port] = [*(before[-FORMER:] if is_saved else before), to]
+        led = {**known, **led}
         if led == known:
             return
         self._led[key] = led

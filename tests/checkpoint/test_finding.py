@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
+from holdfast.checkpoint.addresses import FORMER
 from tests.checkpoint.guards import running
 from tests.checkpoint.players import Note, Notes, Sink, start
 from tests.checkpoint.strikes import sink
@@ -189,13 +190,17 @@ async def test_a_binding_that_transactions_have_changed_is_met_by_no_turn_before
         assert await notes(system) == [["1", "5"], ["2", "4"], ["3", "6"]]
 
 
-async def test_where_a_binding_led_before_a_snapshot_is_forgotten(tmp_path: Path) -> None:
+async def test_where_a_binding_led_before_a_snapshot_is_forgotten_in_time(tmp_path: Path) -> None:
     async with running(f"sqlite:{tmp_path / 'app.db'}") as system:
         ref = await outgoing(system, "/app/first")
         assert await ref.ask(Note("1")) == 1
         system.bind(ref, "out", "/app/second")
         led = system._homes.addresses.led
         assert led.alike(ref.path, "/app/second") == {"/app/first", "/app/second"}
+        for number in range(2 * FORMER):
+            system.bind(ref, "out", await system.start(hf.child(f"sink{number}", hf.start(Sink))))
+        assert len(led.alike(ref.path, "/app/first")) == 2 * FORMER + 2
         await system.checkpoint(ref)
         system.bind(ref, "out", "/app/third")
-        assert led.alike(ref.path, "/app/third") == {"/app/third"}
+        assert led.alike(ref.path, "/app/first") == set()
+        assert len(led.alike(ref.path, "/app/third")) == FORMER + 1

@@ -61,7 +61,7 @@ CHECKS = {
         FINDING,
         "transactions_have_changed",
     ),
-    "where a binding led before a snapshot is forgotten": Check(
+    "where a binding led before a snapshot is forgotten in time": Check(
         "checkpoint/home/homes.py",
         "            is_saved = switch.ledger.turn <= switch.ledger.state_turn\n",
         "            is_saved = False\n",
