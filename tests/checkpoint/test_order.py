@@ -21,7 +21,7 @@ from tests.checkpoint.order_player import RECEIVERS, SUPERVISORS
 
 SCRIPT = Path(__file__).with_name("order_player.py")
 PATHS = os.pathsep.join(filter(None, (str(Path(holdfast.__file__).parents[1]), os.environ.get("PYTHONPATH"))))
-ROUNDS = int(os.environ.get("HOLDFAST_ORDER", "2"))
+ROUNDS = int(os.environ.get("HOLDFAST_ORDER", "1"))
 SEED = int(os.environ.get("HOLDFAST_SEED", "20261128"))
 
 Steps = list[list[Any]]
