@@ -9,6 +9,7 @@ import asyncio
 import contextlib
 import os
 import signal
+import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,6 +28,9 @@ from tests.ftm.test_random_hooks import IN_TIME, Close, Enter, Entered, Fail, Ro
 pytestmark = pytest.mark.asyncio(loop_factories=["uvloop"])
 
 
+RECOVERIES: dict[str, Method | None] = {"nothing kept": None, "hybrid": hf.hybrid(interval=3600.0)}
+
+
 class Returns(hf.Message[tuple[int, bool]]):
     """How often the actor has returned, and whether the door is open."""
 
@@ -36,6 +40,10 @@ class Pause(hf.Message[None]):
 
     process: int
     file: str
+
+
+class Spoil(hf.Message[None]):
+    """A turn that leaves what nobody can save."""
 
 
 class Mark(hf.Message[None]):
@@ -54,6 +62,10 @@ class Porch(Room):
         end = time.monotonic() + IN_TIME
         while os.getpid() == message.process and not Path(message.file).exists() and time.monotonic() < end:
             time.sleep(0.005)
+
+    @hf.on(Spoil)
+    def spoil(self, message: Spoil) -> None:
+        self.lock = threading.Lock()
 
     @hf.on(Mark)
     def mark(self, message: Mark) -> None:
@@ -98,12 +110,12 @@ async def said(ref: hf.ActorRef[Any], messages: Sequence[hf.Message[Any]]) -> li
     return [type(one).__name__ if isinstance(one, BaseException) else one for one in found]
 
 
-@pytest.mark.parametrize("name", sorted(mechanisms()))
-@pytest.mark.parametrize("recovery", [None, hf.hybrid(interval=3600.0)], ids=["without recovery", "hybrid"])
-async def test_what_hooks_do_stands_behind_all_that_came_before_the_failure(name: str, recovery: Method | None) -> None:
-    mechanism = mechanisms()[name]
-    if mechanism is None and recovery is None:
-        pytest.skip("nothing of its state is kept")
+KEPT = [(name, how) for name in sorted(mechanisms()) for how in RECOVERIES if (name, how) != ("none", "nothing kept")]
+
+
+@pytest.mark.parametrize(("name", "how"), KEPT)
+async def test_what_hooks_do_stands_behind_all_that_came_before_the_failure(name: str, how: str) -> None:
+    mechanism, recovery = mechanisms()[name], RECOVERIES[how]
     async with hf.ActorSystem("app", log=False, intensity=100_000) as system:
         ref = await system.start(hf.child("porch", hf.start(Porch), recovery=recovery, mechanism=mechanism))
         if mechanism is not None:
@@ -151,6 +163,26 @@ async def test_a_turn_that_waits_in_the_middle_of_a_batch_is_no_failure(name: st
         await two_again(ref)
         burst = [Enter(0), Enter(1), Close(), Consult(other), Enter(2), Consult(other), Returns()]
         assert await said(ref, burst) == [1, 2, None, 0, 3, 0, (0, False)]
+
+
+@pytest.mark.parametrize(("name", "how"), KEPT)
+async def test_what_hooks_put_back_comes_right_behind_the_failure(name: str, how: str) -> None:
+    async with hf.ActorSystem("app", log=False, intensity=100_000) as system:
+        spec = hf.child("porch", hf.start(Porch), recovery=RECOVERIES[how], mechanism=mechanisms()[name])
+        ref = await system.start(spec)
+        if name != "none":
+            await two_again(ref)
+        burst = [Enter(0), Close(), Wait(1), Enter(2), Fail(), Enter(3), Enter(4)]
+        assert await said(ref, burst) == [1, None, 3, 2, "RemoteCrash", 4, 5]
+
+
+@pytest.mark.parametrize("name", ["pbr", "tr", "tmr", "pbr+tr"])
+async def test_a_life_recovers_once_from_a_turn_that_leaves_what_nobody_can_save(name: str) -> None:
+    async with hf.ActorSystem("app", log=False, intensity=100_000) as system:
+        ref = await system.start(hf.child("porch", hf.start(Porch), mechanism=mechanisms()[name]))
+        await two_again(ref)
+        first, *_, second, returns = await said(ref, [Enter(0), Enter(1), Close(), Spoil(), Enter(2), Returns()])
+        assert (first, second, returns) == (1, 3, (1, True))
 
 
 async def test_a_failure_that_the_follower_alone_has_come_to_is_recorded_with_what_its_hooks_did(

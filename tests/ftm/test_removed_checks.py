@@ -375,7 +375,7 @@ CHECKS = {
         "                attempts.owed.add(failed)\n                attempts.is_undone = True\n",
         "                pass\n",
         IN_A_BATCH,
-        "test_what_hooks_do and hybrid-lfr",
+        "test_what_hooks_do and lfr-hybrid",
     ),
     "a life that begins again to go on has recovered from nothing": Check(
         "ftm/replica/protected_actor.py",
@@ -383,6 +383,34 @@ CHECKS = {
         "Go(has_state, life.turn)",
         IN_A_BATCH,
         "test_a_life_recovers_once",
+    ),
+    "what hooks put back comes right behind the failure": Check(
+        "ftm/replica/protected_actor.py",
+        "(self.reports.is_snapshot_wanted or self.has_returned)\n",
+        "self.reports.is_snapshot_wanted\n",
+        IN_A_BATCH,
+        "test_what_hooks_put_back and kept",
+    ),
+    "a life that begins again to find who has spoiled its state has recovered from nothing": Check(
+        "ftm/replica/protected_actor.py",
+        "self.attempts.is_undone = len(begun) > 1 and self.life",
+        "self.attempts.is_undone = False and self.life",
+        IN_A_BATCH,
+        "test_a_life_recovers_once_from_a_turn",
+    ),
+    "what on_start leaves under replay is not undone": Check(
+        "ftm/replica/protected_actor.py",
+        "len(begun) > 1 and self.life is not None and self.life.is_live\n",
+        "len(begun) > 1\n",
+        SPOILED,
+        "begins_with_what_nobody and tr",
+    ),
+    "whoever wants a life while one is ended has the next one": Check(
+        "ftm/replica/protected_actor.py",
+        "            async with self._beginning:  # Whoever wants",
+        "            if True:  # Whoever wants",
+        LFR,
+        "test_kills_at_any_moment",
     ),
     "a turn that has waited in the middle of a part is no failure": Check(
         "ftm/replica/protected_actor.py",
