@@ -15,6 +15,7 @@ What Hypothesis draws depends on the test alone, so a run today finds what it fo
 """
 
 import asyncio
+import contextlib
 import os
 import random
 import signal
@@ -43,7 +44,7 @@ from holdfast.testing.guard.loop_leaks import LoopLeaks
 from holdfast.testing.guard.process_leaks import GRACE, end_processes, is_of_test
 from tests.pairs import covering
 from tests.waits import Waits
-from tests.warm import WarmServers
+from tests.warm import WarmServers, warm_popen
 
 # Installed, the plugin comes by its entry point; in a checkout whose metadata is older it is named here. Not both:
 # pytest refuses to register it under two names.
@@ -308,6 +309,13 @@ def structlog_as_it_was() -> Iterator[None]:
 def warm_fork_servers(nothing_left: None, warm_servers: WarmServers | None, monkeypatch: pytest.MonkeyPatch) -> None:
     if warm_servers is not None:
         monkeypatch.setattr(fork_server, "exec_server", warm_servers.exec_server)
+
+
+@pytest.fixture
+def warm_programs(warm_servers: WarmServers | None) -> Iterator[None]:
+    """Fork programs that a test starts with our interpreter from the warm process, and their fork servers, too."""
+    with contextlib.nullcontext() if warm_servers is None else warm_popen(warm_servers):
+        yield
 
 
 @pytest.fixture

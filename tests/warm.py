@@ -9,6 +9,10 @@ Started by exec are those of the tests of the fork server itself (`tests/actors/
 that say so with the fixture `cold_fork_servers`), of every program that a test starts, and all with `HOLDFAST_COLD=1`.
 So are those with another interpreter, other flags of Python, or another setting of what is read as a program starts.
 
+Tests that start programs again and again, which also import holdfast first and start a fork server of their own, say so
+with `pytest.mark.usefixtures("warm_programs")`: what `subprocess` would start there with our interpreter and no option
+of Python is forked from the warm process, too, and so are the fork servers of those programs.
+
 Run as a program, this is the warm process.
 """
 
@@ -18,9 +22,11 @@ import contextlib
 import ctypes
 import importlib
 import importlib.util
+import inspect
 import json
 import os
 import resource
+import runpy
 import signal
 import socket
 import struct
@@ -28,15 +34,18 @@ import subprocess
 import sys
 import threading
 import time
+import traceback
+from collections.abc import Callable, Generator
+from types import ModuleType
 from typing import Any, NoReturn
 
 import psutil
 
 MODULES = (
     "holdfast.system.worker_main", "holdfast.actors.process.fork.zygote", "holdfast.ftm.replica.replica",
-    "pytest", "hypothesis", "psutil", "uvloop",
+    "pytest", "hypothesis", "psutil", "uvloop", "holdfast.console.commands", "typer", "rich.console",
 )  # fmt: skip
-"""What nearly every fork server of the tests imports."""
+"""What nearly every fork server of the tests imports, or every command of the command line."""
 AT_START = ("PYTHON", "LD_", "MALLOC_", "GLIBC_", "LC_", "LANG", "COVERAGE", "OMP_", "OPENBLAS_", "MKL_")
 """Variables that are read once, as a program or a module begins."""
 LIMITS = tuple(getattr(resource, name) for name in dir(resource) if name.startswith("RLIMIT_"))
@@ -53,6 +62,8 @@ def prctl(option: int, argument: int) -> None:
 
 WARM: set[int] = set()
 """The warm processes of this one."""
+IMPORT_PATH: list[str] = []
+"""Where the interpreter found modules as the warm process was started."""
 
 
 def own_children() -> list[psutil.Process]:
@@ -96,81 +107,168 @@ class Forked:
 
 
 class WarmServers:
-    """The warm process, seen from pytest: `exec_server` stands in place of `launch.exec_server`."""
+    """A warm process, seen from the one that it forks for: `exec_server` stands in place of `launch.exec_server`."""
 
     def __init__(self) -> None:
-        from holdfast.actors.process.fork import boot, launch
+        from holdfast.actors.process.fork import launch
 
         self._launch = launch
-        command = launch.server_command(0)
-        self._command = command[: command.index("-P") + 1]
-        environment = launch.server_environment()
-        self._at_start = _at_start(environment)
+        self._command = self._flags(launch.server_command(0))
+        self._at_start = _at_start(launch.server_environment())
         self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._control.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, PACKET_BYTES)
-        config = launch.server_config("", [])
-        begin = {"boot": os.path.abspath(boot.__file__), "path": config.path}
-        begin |= {"package": config.package, "package_path": config.package_path}
-        with theirs:
-            self._control.send(json.dumps(begin).encode())
-            self._process = subprocess.Popen(
-                [*self._command, os.path.abspath(__file__), str(theirs.fileno())],
-                stdin=subprocess.DEVNULL,
-                pass_fds=(theirs.fileno(),),
-                env=environment,
-                start_new_session=True,
-            )
-        WARM.add(self._process.pid)
         self._owner = os.getpid()
         self._is_ready = False
         self._lock = threading.Lock()
+        with theirs:
+            self._pid = self._begin(theirs)
+        WARM.add(self._pid)
+
+    def _begin(self, theirs: socket.socket) -> int:
+        """Start the warm process, which imports what it needs; its pid."""
+        from holdfast.actors.process.fork import boot
+
+        config = self._launch.server_config("", [])
+        begin = {"boot": os.path.abspath(boot.__file__), "path": config.path}
+        begin |= {"package": config.package, "package_path": config.package_path}
+        self._control.send(json.dumps(begin).encode())
+        started = subprocess.Popen(
+            [*self._command, os.path.abspath(__file__), str(theirs.fileno())],
+            stdin=subprocess.DEVNULL,
+            pass_fds=(theirs.fileno(),),
+            env=self._launch.server_environment(),
+            start_new_session=True,
+        )
+        started.returncode = 0  # It is waited for in `close`.
+        return started.pid
 
     def exec_server(self, control_fd: int) -> Any:
         """A fork server, as our child; by exec if a warm one would be another."""
         command, environment = self._launch.server_command(control_fd), self._launch.server_environment()
-        like_ours = command[: command.index("-P") + 1] == self._command and _at_start(environment) == self._at_start
-        if not like_ours or os.getpid() != self._owner:
+        if self._flags(command) != self._command or not self._is_like_ours(environment):
             return self._launch.exec_server(control_fd)
-        order = {
-            "program": command[-2],
-            "environment": environment,
-            "folder": os.getcwd(),
-            "umask": umask(),
-            "limits": [[which, *resource.getrlimit(which)] for which in LIMITS],
-        }
-        with self._lock, open(os.devnull, "r+b") as nothing:
+        order = {"server": command[-2], "environment": environment, "folder": os.getcwd()}
+        with open(os.devnull, "r+b") as nothing:
+            streams = [nothing.fileno() if self._launch.inherited(fd) is not None else fd for fd in (1, 2)]
+            return Forked(self._order(order, [nothing.fileno(), *streams, control_fd]))
+
+    def exec_program(
+        self,
+        command: list[str],
+        environment: dict[str, str] | None,
+        folder: str | None,
+        streams: list[int],
+        *,
+        leads_session: bool,
+    ) -> int | None:
+        """A program as our child, its pid; None if it must be started by exec."""
+        environment = dict(os.environ) if environment is None else environment
+        own_path = os.environ.get("PYTHONPATH", "")
+        if command[0] != sys.executable or not self._is_like_ours(environment | {"PYTHONPATH": own_path}):
+            return None
+        if len(command) < 2 or (command[1].startswith("-") and command[1] not in ("-c", "-m")):
+            return None
+        order = {"program": command[1:], "environment": environment, "folder": folder or os.getcwd()}
+        return self._order(order | {"leads session": leads_session}, streams)
+
+    def close(self) -> None:
+        """End the warm process."""
+        self._control.close()
+        with contextlib.suppress(ChildProcessError):
+            os.waitpid(self._pid, 0)
+        WARM.discard(self._pid)
+
+    def _flags(self, command: list[str]) -> list[str]:
+        return command[: command.index("-P") + 1]
+
+    def _is_like_ours(self, environment: dict[str, str]) -> bool:
+        at_start = _at_start(self._launch.server_environment() | environment)
+        return at_start == self._at_start and os.getpid() == self._owner
+
+    def _order(self, order: dict[str, Any], fds: list[int]) -> int:
+        """Have a process forked: the first three descriptors are its standard streams; its pid."""
+        order |= {"umask": umask(), "limits": [[which, *resource.getrlimit(which)] for which in LIMITS]}
+        with self._lock:
             if not self._is_ready and self._control.recv(100) != b"warm":
                 raise RuntimeError("the warm process of the tests has not come up; HOLDFAST_COLD=1 goes without it")
             self._is_ready = True
-            streams = [fd if self._launch.inherited(fd) is None else nothing.fileno() for fd in (1, 2)]
             # Its own parent ends at once; whoever adopts it is its parent then.
             prctl(PR_SET_CHILD_SUBREAPER, 1)
             try:
-                socket.send_fds(self._control, [json.dumps(order).encode()], [*streams, control_fd])
+                socket.send_fds(self._control, [json.dumps(order).encode()], fds)
                 said = self._control.recv(100)
             finally:
                 prctl(PR_SET_CHILD_SUBREAPER, 0)
         if not said:
             raise RuntimeError("the warm process of the tests has ended; HOLDFAST_COLD=1 goes without it")
         (pid,) = struct.unpack("i", said)
-        return Forked(pid)
+        assert isinstance(pid, int)
+        return pid
 
-    def close(self) -> None:
-        """End the warm process."""
-        self._control.close()
-        self._process.wait()
-        WARM.discard(self._process.pid)
+
+class ServersOfAProgram(WarmServers):
+    """The warm process of a program that was itself forked from one: a fork of the program, before it begins."""
+
+    def _begin(self, theirs: socket.socket) -> int:
+        pid = os.fork()
+        if pid == 0:
+            try:
+                self._control.close()
+                os.setsid()
+                with open(os.devnull, "r+b", buffering=0) as nothing:
+                    for fd in range(3):
+                        os.dup2(nothing.fileno(), fd)
+                prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+                serve(theirs)
+            finally:
+                os._exit(0)
+        return pid
+
+
+@contextlib.contextmanager
+def warm_popen(warm: WarmServers) -> Generator[None]:
+    """Have `subprocess` fork from the warm process what it would start with our interpreter, where that is the same."""
+    by_exec: Callable[..., None] = subprocess.Popen._execute_child  # type: ignore[attr-defined]
+    signature = inspect.signature(by_exec)
+
+    def start(popen: Any, *args: Any, **kwargs: Any) -> None:
+        given = signature.bind(popen, *args, **kwargs).arguments
+        unusual = ("executable", "preexec_fn", "pass_fds", "shell", "gid", "gids", "uid")
+        command = given["args"]
+        pid = None
+        is_usual = given["umask"] == given["process_group"] == -1 and not any(given[name] for name in unusual)
+        if is_usual and isinstance(command, list | tuple):
+            ends = zip((given["p2cread"], given["c2pwrite"], given["errwrite"]), range(3), strict=True)
+            pid = warm.exec_program(
+                [os.fspath(word) for word in command],
+                given["env"],
+                None if given["cwd"] is None else os.fspath(given["cwd"]),
+                [end if end != -1 else fd for end, fd in ends],
+                leads_session=given["start_new_session"],
+            )
+        if pid is None:
+            by_exec(popen, *args, **kwargs)
+            return
+        popen.pid, popen._child_created = pid, True
+        names = ("p2cread", "p2cwrite", "c2pread", "c2pwrite", "errread", "errwrite")
+        popen._close_pipe_fds(*(given[name] for name in names))
+
+    subprocess.Popen._execute_child = start  # type: ignore[attr-defined]
+    try:
+        yield
+    finally:
+        subprocess.Popen._execute_child = by_exec  # type: ignore[attr-defined]
 
 
 def _at_start(environment: dict[str, str]) -> dict[str, str]:
-    return {name: value for name, value in environment.items() if name.startswith(AT_START)}
+    return {name: value for name, value in environment.items() if name.startswith(AT_START) and value}
 
 
 # -- the warm process -------------------------------------------------------------------------------------------------
 
 
-def serve(control: socket.socket) -> None:
-    """Import, then fork until pytest has ended."""
+def warm_up(control: socket.socket) -> None:
+    """Import what those need that are forked."""
     begin = json.loads(control.recv(PACKET_BYTES))
     sys.path[:] = begin["path"]
     spec = importlib.util.spec_from_file_location("warm_boot", begin["boot"])
@@ -186,13 +284,17 @@ def serve(control: socket.socket) -> None:
 
     gc.collect()
     gc.freeze()
+
+
+def serve(control: socket.socket) -> None:
+    """Fork until whom it is done for has ended."""
     try:
         control.send(b"warm")
     except (BrokenPipeError, ConnectionResetError):  # The tests were over before we were warm.
         return
     while True:
         try:
-            data, fds, _, _ = socket.recv_fds(control, PACKET_BYTES, 3)
+            data, fds, _, _ = socket.recv_fds(control, PACKET_BYTES, 4)
         except ConnectionResetError:
             return
         if not data:
@@ -225,17 +327,16 @@ def fork(control: socket.socket, order: dict[str, Any], fds: list[int]) -> int:
 
 
 def become(control: socket.socket, order: dict[str, Any], fds: list[int]) -> NoReturn:
-    """Be as if just started, and run `boot.py`."""
-    code = 1
+    """Be as if just started, and run what was ordered."""
     try:
-        os.setsid()
+        if order.get("leads session", True):
+            os.setsid()
         control.close()
-        with open(os.devnull, "r+b", buffering=0) as nothing:
-            os.dup2(nothing.fileno(), 0)
-        os.dup2(fds[0], 1)
-        os.dup2(fds[1], 2)
-        ours = os.dup(fds[2])
+        streams = [os.dup(fd) for fd in fds]
         for fd in fds:
+            os.close(fd)
+        for number, fd in enumerate(streams[:3]):
+            os.dup2(fd, number)
             os.close(fd)
         os.environ.clear()
         os.environ.update(order["environment"])
@@ -245,21 +346,64 @@ def become(control: socket.socket, order: dict[str, Any], fds: list[int]) -> NoR
         for which, soft, hard in order["limits"]:
             with contextlib.suppress(ValueError, OSError):  # not ours to change
                 resource.setrlimit(which, (soft, hard))
-        sys.argv[:] = [order["program"], str(ours)]
-        boot = importlib.import_module("holdfast.actors.process.fork.boot")
-        sys.modules["__main__"] = boot
-        boot.main()
-        code = 0
+        if "program" not in order:
+            serve_forks(order["server"], streams[3])
     except BaseException:
-        import traceback
-
         traceback.print_exc()
-    finally:
-        os._exit(code)
+        os._exit(1)
+    run_program(order["program"])
+
+
+def serve_forks(program: str, control: int) -> NoReturn:
+    """Run `boot.py`."""
+    sys.argv[:] = [program, str(control)]
+    boot = importlib.import_module("holdfast.actors.process.fork.boot")
+    sys.modules["__main__"] = boot
+    boot.main()
+    os._exit(0)
+
+
+def run_program(words: list[str]) -> NoReturn:
+    """Run a program as the interpreter would that is given these words, and end as it would."""
+    from holdfast.actors.process.fork import fork_server
+
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    setattr(fork_server, "exec_server", ServersOfAProgram().exec_server)  # noqa: B010  # mypy: it is imported there
+    main = ModuleType("__main__")
+    main.__dict__["__builtins__"] = __builtins__
+    sys.modules["__main__"] = main
+    kind, *rest = words
+    first = os.path.dirname(os.path.abspath(kind)) if kind not in ("-c", "-m") else "" if kind == "-c" else os.getcwd()
+    added = [os.path.abspath(one) for one in os.environ.get("PYTHONPATH", "").split(os.pathsep) if one]
+    sys.path[:] = [first, *added, *(one for one in IMPORT_PATH if one not in added)]
+    try:
+        if kind == "-c":
+            sys.argv[:] = ["-c", *rest[1:]]
+            exec(compile(rest[0], "<string>", "exec"), main.__dict__)
+        elif kind == "-m":
+            sys.argv[:] = ["-m", *rest[1:]]
+            runpy._run_module_as_main(rest[0])  # type: ignore[attr-defined]
+        else:
+            sys.argv[:] = words
+            main.__file__ = kind
+            with open(kind, "rb") as file:
+                exec(compile(file.read(), kind, "exec"), main.__dict__)
+    except (SystemExit, KeyboardInterrupt):
+        raise
+    except BaseException as error:
+        frames = error.__traceback__
+        while frames is not None and frames.tb_frame.f_code.co_filename in (__file__, runpy.__file__):
+            frames = frames.tb_next
+        sys.excepthook(type(error), error.with_traceback(frames), frames)
+        raise SystemExit(1) from None
+    raise SystemExit(0)
 
 
 if __name__ == "__main__":
+    IMPORT_PATH[:] = sys.path
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    serve(socket.socket(fileno=int(sys.argv[1])))
+    with socket.socket(fileno=int(sys.argv[1])) as ours:
+        warm_up(ours)
+        serve(ours)
     os._exit(0)

@@ -209,6 +209,7 @@ class LifeStage:
         ending: that it is to end behind the turn in hand, as that has said.
         stop_wanted: why it is to end when it is live.
         stopping: why it is to end behind the turn in hand, as it was told.
+        ends_itself: that it is the turn in hand which has it end, at this moment.
         stop_turn: the turn that has said so, if it was handled again; -1: it was none.
         begun: the input that has sent something in a turn without an end: it comes before what hooks have put back.
         is_cut_off: whether it ends by an EXIT that it does not trap.
@@ -226,6 +227,7 @@ class LifeStage:
     ending: EndWanted | None = None
     stop_wanted: ExitReason | None = None
     stopping: ExitReason | None = None
+    ends_itself: bool = False
     stop_turn: int = -1
     begun: int = -1
     is_cut_off: bool = False

@@ -610,10 +610,12 @@ class RecordedContext(ActorContext):
     def stop(self, reason: ExitReason = NORMAL) -> None:
         life = self.recorded
         stage, feed = life.stage, life.feed
-        if feed is not None and self._in_turn() and stage.ending is None:
+        ends_itself = feed is not None and self._in_turn()
+        if ends_itself and stage.ending is None:
             stage.ending = EndWanted(life.turn, msgspec.msgpack.encode(pack_exit(reason)), stage.is_cut_off)
         if life.is_live:
-            super().stop(reason)
+            self._alive()
+            life.end(reason, ends_itself=ends_itself)
         else:  # A replayed turn, or a hook: the life ends when it has caught up.
             stage.stop_wanted = reason
             stage.stop_turn = -1 if feed is None else feed.turn

@@ -397,13 +397,23 @@ class Life:
         for call in postponed:
             self.cell.urge(call)
 
+    def end(self, reason: ExitReason, *, ends_itself: bool) -> None:
+        """Have the actor stopped, as others would: by the turn in hand, or by a hook or a task beside it."""
+        self.stage.ends_itself = ends_itself
+        self.cell.request_stop(reason)
+        self.stage.ends_itself = False
+
     def stop(self, reason: ExitReason) -> None:
         """End in good order: behind the turn in hand, or in the middle of one that rests, also if it does so only then.
 
         So it is in one that waits for an answer of somebody who has been stopped before. The next life goes on with
-        that. There is no snapshot of such a moment, and `on_stop` is not called in it.
+        that. There is no snapshot of such a moment, and `on_stop` is not called in it. A turn that ends the life itself
+        comes to its own end: there may be no next life.
         """
         if self.cell.state is not RUNNING:
+            return
+        if self.stage.ends_itself:
+            self.cell.urge(StopRecorded(self, reason))
             return
         turn = None if self.cell.more is None else self.cell.more.turn
         if self.waits.resting and turn is not None and turn.then is None:

@@ -20,6 +20,8 @@ from tests.checkpoint.ledger_player import FORKED, MANY, Book, Change, Ledger, T
 from tests.checkpoint.players import start
 from tests.checkpoint.strikes import NEVER, strike
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 SEED = 20_261_127
 FEW = 8
 """Segments that an image may be spread over, so that little has to be saved until they are gathered."""
@@ -133,7 +135,7 @@ async def test_a_state_that_is_saved_often_is_never_written_as_a_whole_again(
             want.change(0, "append")
             await ref.ask(Change(0, "append"), timeout=25.0)
             await taken(system, ref)
-        for seed in range(3 * FEW):
+        for seed in range(2 * FEW):
             want.change(seed, "replace")
             await ref.ask(Change(seed, "replace"), timeout=25.0)
             one = await taken(system, ref)
@@ -167,7 +169,7 @@ def test_the_root_dies_in_the_middle_of_a_snapshot(tmp_path: Path, where: str) -
     moments = random.Random(SEED)
     print(f"seed {SEED}")
     store, following = tmp_path / "app.db", 0
-    for _ in range(3):
+    for _ in range(2):
         fatal = following + moments.randint(3, 30)
         root = begin(store, where, following, 1_000_000)
         assert root.stdout is not None

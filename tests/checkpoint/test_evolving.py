@@ -15,6 +15,8 @@ import holdfast as hf
 from holdfast.checkpoint.schema import difference, shape_of
 from tests.checkpoint.test_restart_root import PATHS
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 PLAYER = Path(__file__).with_name("evolving_player.py")
 CODE = """
 import holdfast as hf
@@ -319,6 +321,7 @@ def test_structs_in_a_message_count_too() -> None:
 SENDS = """
 import holdfast as hf
 import msgspec
+
 
 
 class Note(hf.Message):

@@ -14,6 +14,8 @@ from tests.checkpoint.conftest import ROOT
 from tests.checkpoint.players import Barrier, Let, Pass, start, until
 from tests.checkpoint.strikes import NEVER, strike
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 SHORT = 0.2
 METHODS: dict[str, Any] = {
     "plain": None,
@@ -159,6 +161,7 @@ PROGRAM = """
 import asyncio, os, sys
 import holdfast as hf
 from tests.checkpoint.test_given_up import METHODS, Barrier, Booked, Hold, Hotel, Let, Open, SHORT, Book, waits_at
+
 
 async def main(store: str, name: str, way: str, is_first: bool) -> None:
     async with hf.ActorSystem("app", store=store, log=False) as system:

@@ -20,6 +20,8 @@ import pytest
 
 import holdfast
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 SCRIPT = Path(__file__).with_name("kill_player.py")
 PATHS = os.pathsep.join(filter(None, (str(Path(holdfast.__file__).parents[1]), os.environ.get("PYTHONPATH"))))
 KILLS = int(os.environ.get("HOLDFAST_KILLS", "12"))

@@ -14,6 +14,8 @@ import pytest
 
 import holdfast
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 SCRIPT = Path(__file__).with_name("meeting_player.py")
 PATHS = os.pathsep.join(filter(None, (str(Path(holdfast.__file__).parents[1]), os.environ.get("PYTHONPATH"))))
 KILLS = 6

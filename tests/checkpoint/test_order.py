@@ -19,6 +19,8 @@ import pytest
 import holdfast
 from tests.checkpoint.order_player import RECEIVERS, SUPERVISORS
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 SCRIPT = Path(__file__).with_name("order_player.py")
 PATHS = os.pathsep.join(filter(None, (str(Path(holdfast.__file__).parents[1]), os.environ.get("PYTHONPATH"))))
 ROUNDS = int(os.environ.get("HOLDFAST_ORDER", "1"))

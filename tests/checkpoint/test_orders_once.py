@@ -16,7 +16,7 @@ from tests.checkpoint.players import start, until
 from tests.checkpoint.strikes import event, strike, struck
 from tests.checkpoint.test_verbs import PATHS, method
 
-pytestmark = pytest.mark.pairs
+pytestmark = [pytest.mark.pairs, pytest.mark.usefixtures("warm_programs")]
 
 IN_TIME = 30.0
 STARTED, RECOVERED = "on_start", "on_recovered"

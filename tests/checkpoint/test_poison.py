@@ -13,6 +13,8 @@ import pytest
 from tests.checkpoint.poison_player import DELIVERIES
 from tests.checkpoint.test_restart_root import PATHS
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 PLAYER = Path(__file__).with_name("poison_player.py")
 
 

@@ -516,6 +516,13 @@ CHECKS = {
         RACES,
         "test_nor_if_its_home_did_not_hear",
     ),
+    "a turn that ends its actor is not left in the middle": Check(
+        "checkpoint/life/recorded_life.py",
+        "        if self.stage.ends_itself:\n",
+        "        if False:\n",
+        "tests/checkpoint/test_restart_ends.py",
+        "test_a_turn_that_ends_its_actor_is_over_before",
+    ),
     "a turn that ends gives up what it waits for": Check(
         "checkpoint/life/recorded_life.py",
         "            self.waits.order.end_turn()\n",

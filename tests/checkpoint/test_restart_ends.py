@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 
@@ -208,5 +208,83 @@ def test_a_permanent_child_that_replays_all_its_turns_ends_once() -> None:
         assert await ann.ask(Alive()) == 1
         ann.kill()
         assert await ann.ask(Alive(), timeout=20.0) == 1
+
+    run()
+
+
+class Cue(hf.Message): ...
+
+
+class Part(hf.Message[str]):
+    way: str
+
+
+async def told() -> int:
+    return 1
+
+
+class Actor(hf.Actor):
+    """Has something to wait for in a turn, tells, and ends itself."""
+
+    listener: hf.Binding[Listener]
+
+    @hf.on(Part)
+    async def play(self, message: Part) -> str:
+        await self.ctx.sleep(0.1)
+        pending: set[asyncio.Future[Any]] = set()
+        match message.way:
+            case "a message that is there":
+                await self.ctx.wait_for(Cue)
+            case "one of two":
+                ways: set[asyncio.Future[Any]] = {
+                    asyncio.ensure_future(self.ctx.sleep(1e6)),
+                    asyncio.ensure_future(self.ctx.effect(told, key="k")),
+                }
+                _, pending = await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
+            case "behind its end":
+                self.ctx.stop()
+                await self.ctx.sleep(5.0)
+        self.listener.tell(Ended())
+        self.ctx.stop()
+        for one in pending:
+            one.cancel()
+        return "played"
+
+    @hf.on(Cue)
+    def cue(self, message: Cue) -> None: ...
+
+
+def player(durability: Literal["memory", "os"]) -> hf.ChildSpec:
+    recovery, bindings = hf.hybrid(durability=durability), {"listener": "/app/listener"}
+    return hf.child("actor", hf.start(Actor), restart="transient", recovery=recovery, bindings=bindings)
+
+
+@pytest.mark.parametrize("has_store", [True, False])
+@pytest.mark.parametrize("way", ["a message that is there", "one of two", "behind its end"])
+def test_a_turn_that_ends_its_actor_is_over_before(way: str, has_store: bool) -> None:
+    @simulate(seeds=SEEDS, store="simulated" if has_store else None)
+    async def run(system: GuardedSystem) -> None:
+        listener = await system.start(hf.child("listener", hf.start(Listener), recovery=hf.hybrid()))
+        actor = await system.start(player("memory"))
+        asked = asyncio.ensure_future(actor.ask(Part(way), timeout=60.0))
+        if way == "a message that is there":
+            await actor.send(Cue())
+        assert await asked == "played"
+        assert await listener.ask(Heard()) == 1
+
+    run()
+
+
+def test_a_turn_that_has_ended_its_actor_and_rests_is_over_before_also_after_a_crash() -> None:
+    @simulate(seeds=SEEDS, store="simulated")
+    async def run(system: GuardedSystem, simulation: Simulation) -> None:
+        await system.start(hf.child("listener", hf.start(Listener), recovery=hf.hybrid()))
+        await (await system.start(player("os"))).send(Part("behind its end"))
+        await advance(2.0)
+        system = await simulation.crash_root()
+        listener = await system.start(hf.child("listener", hf.start(Listener), recovery=hf.hybrid()))
+        await system.start(player("os"))
+        await advance(10.0)
+        assert await listener.ask(Heard()) == 1
 
     run()

@@ -10,6 +10,8 @@ import pytest
 
 from tests.checkpoint.conftest import ROOT
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 HEARD = {
     "by id": "/app/house/dynamic/one",
     "without id": "AskTimeout None",

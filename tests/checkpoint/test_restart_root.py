@@ -9,7 +9,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import holdfast
+
+pytestmark = pytest.mark.usefixtures("warm_programs")
 
 SCRIPT = Path(__file__).with_name("root_player.py")
 # The root of the package may be its folder under another name, so the way to it is told.

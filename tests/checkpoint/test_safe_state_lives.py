@@ -21,6 +21,8 @@ from tests.checkpoint.guards import Faint, Halt, Planner, Resume, Wheels, over, 
 from tests.checkpoint.players import until
 from tests.checkpoint.strikes import NEVER, strike
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 PLAYER = Path(__file__).with_name("safe_state_player.py")
 WHEELS, PLANNER = "/app/top/wheels", "/app/top/planner"
 

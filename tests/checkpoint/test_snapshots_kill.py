@@ -22,6 +22,8 @@ from tests.checkpoint.image_player import CELLS, MANY, Canvas, Digest, Paint, Tu
 from tests.checkpoint.players import start, until
 from tests.checkpoint.strikes import NEVER
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 SEED = 20_261_121
 ROUNDS = 6
 SCRIPT = Path(__file__).with_name("snapshot_root.py")

@@ -13,7 +13,7 @@ import pytest
 
 from tests.checkpoint.test_verbs import PATHS
 
-pytestmark = pytest.mark.pairs
+pytestmark = [pytest.mark.pairs, pytest.mark.usefixtures("warm_programs")]
 
 GONE = ["made up", "given", "recorded", "spawned"]
 MAY_COME = ["listed", "keyed", "journaled"]

@@ -16,7 +16,7 @@ import holdfast as hf
 from tests.checkpoint.players import Note, Notes, Sink, start, until
 from tests.checkpoint.strikes import NEVER, home, strike
 
-pytestmark = pytest.mark.pairs
+pytestmark = [pytest.mark.pairs, pytest.mark.usefixtures("warm_programs")]
 
 FIRST, RESTORED, TURN, RECOVERED, STOPPED = "on_start(False)", "on_start(True)", "turn", "on_recovered", "on_stop"
 

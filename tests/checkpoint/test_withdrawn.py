@@ -18,6 +18,8 @@ from tests.checkpoint.conftest import ROOT
 from tests.checkpoint.players import until
 from tests.checkpoint.withdrawn_player import METHODS, Done, Put, Slow, noted, slow
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 SHORT, LONG = 0.1, 60.0
 PLAYER = "tests.checkpoint.withdrawn_player"
 WHERE = ("task", "process", "subtree")

@@ -23,6 +23,8 @@ from holdfast.cluster.store_copy import copy_store
 from tests.cluster.servers import NatsServers
 from tests.cluster.shelves import copied, fill, found_in
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 SHORT = 1.5
 """How long a copy waits for servers in these tests, in seconds."""
 LONG = pytest.mark.skipif("HOLDFAST_COPIES" not in os.environ, reason="a campaign: HOLDFAST_COPIES=1 has all of them")

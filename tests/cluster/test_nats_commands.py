@@ -18,6 +18,8 @@ from holdfast.console.commands import commands
 from tests.cluster.servers import NatsServers, free_ports, server_binary
 from tests.cluster.shelves import Put, Shelf
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 
 def nats(*arguments: str) -> Result:
     return CliRunner().invoke(commands, ["nats", *arguments])

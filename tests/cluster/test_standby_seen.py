@@ -22,10 +22,13 @@ from tests.cluster.fleet import Programs
 from tests.cluster.servers import NatsServers
 from tests.console.commands import holdfast
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 WAITS = """
 import asyncio, sys
 import holdfast as hf
 from holdfast.console.endpoint import served
+
 
 async def main():
     async with served(hf.ActorSystem("bank", store=sys.argv[1], standby="warm", log=False)):

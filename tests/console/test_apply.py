@@ -21,6 +21,8 @@ from holdfast.system.transaction.change import Change
 from tests.console.commands import holdfast
 from tests.system.trees import Add, counter, picture, ref
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 ROOT = Path(__file__).parents[2]
 DONE, FAILED, UNUSABLE = 0, 1, 2
 GROW = """
@@ -171,6 +173,7 @@ OWN = """
 import holdfast as hf
 {imported}
 from tests.system.trees import Counter, Double
+
 
 
 class Own(Double): ...

@@ -15,6 +15,8 @@ from holdfast.console.endpoint import control_endpoint
 from holdfast.console.remote import RemoteSystem
 from tests.console.commands import holdfast
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 
 class Far(hf.Message[str]):
     text: str = "nothing"

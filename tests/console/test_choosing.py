@@ -4,6 +4,8 @@ import asyncio
 import json
 from pathlib import Path
 
+import pytest
+
 import holdfast as hf
 from holdfast import diagnosis
 from holdfast.actors.events import EventStream
@@ -12,6 +14,8 @@ from holdfast.diagnosis.observations import Observation
 from holdfast.diagnosis.observers import Manner
 from holdfast.diagnosis.repair import Policy, RepairTold
 from tests.console.commands import holdfast
+
+pytestmark = pytest.mark.usefixtures("warm_programs")
 
 DONE, FAILED, UNUSABLE = 0, 1, 2
 QUICK = Manner(every=0.1, time_to_live=2.0)

@@ -13,6 +13,8 @@ import holdfast as hf
 from holdfast.console import cli
 from holdfast.console.commands import commands
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 UNUSABLE = 2
 
 
@@ -51,6 +53,7 @@ import sys
 for name in ("numpy", "PIL", "rtbdata"):
     sys.modules[name] = None  # as if it were not installed
 from holdfast.console.cli import app
+
 
 sys.argv[1:] = {arguments}
 app()

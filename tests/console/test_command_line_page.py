@@ -3,6 +3,7 @@
 import asyncio
 import re
 import shlex
+import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -13,6 +14,9 @@ import pytest
 from holdfast.console.commands import commands
 from holdfast.console.service.project import write_project
 from tests.console.shown import is_shown, sections, steps
+from tests.programs import python
+
+pytestmark = pytest.mark.usefixtures("warm_programs")
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "command-line.md").read_text("utf-8")
 SECTIONS = sections(PAGE, "###")
@@ -38,15 +42,8 @@ async def said(line: str) -> str:
     """What a command prints, to both outputs, and its exit status if that is not 0."""
     program, *arguments = shlex.split(line)
     assert program == "holdfast"
-    process = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-m", "holdfast.console.cli", *arguments),
-        stdin=asyncio.subprocess.DEVNULL,
-        stdout=asyncio.subprocess.PIPE,
-        stderr=asyncio.subprocess.STDOUT,
-    )
-    async with asyncio.timeout(25):
-        output, _ = await process.communicate()
-    return output.decode() + (f"[exit {process.returncode}]\n" if process.returncode else "")
+    done = await python("-m", "holdfast.console.cli", *arguments, stderr=subprocess.STDOUT, timeout=25)
+    return done.stdout + (f"[exit {done.returncode}]\n" if done.returncode else "")
 
 
 @pytest.mark.parametrize("title", SECTIONS)

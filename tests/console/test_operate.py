@@ -22,6 +22,8 @@ from tests.cluster.shelves import Grow, Shelf
 from tests.console.commands import holdfast
 from tests.system.trees import Add, Counter, ref
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 DONE, FAILED, UNUSABLE = 0, 1, 2
 PATHS = (
     "a program opens an endpoint by control_endpoint(system), and with a path of its own it is reached by --socket FILE"
@@ -94,6 +96,7 @@ DIES = """
 import asyncio, os, sys
 import holdfast as hf
 from holdfast.console.endpoint import control_endpoint
+
 
 async def main():
     async with hf.ActorSystem("till one", log=False) as system, control_endpoint(system) as path:

@@ -20,6 +20,8 @@ from holdfast.console.service.notify import Notifier
 from tests.console.commands import holdfast
 from tests.system.trees import Counter
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 DONE, FAILED, UNUSABLE = 0, 1, 2
 WORDS = "import holdfast as hf\n\n\nclass Tick(hf.Message): ...\n"
 ACTORS = """
@@ -65,6 +67,7 @@ STUBBORN = """
 import asyncio
 from pathlib import Path
 import holdfast as hf
+
 
 
 class Polite(hf.Actor):

@@ -13,6 +13,8 @@ import holdfast as hf
 from holdfast.console.endpoint import control_endpoint
 from tests.console.commands import holdfast
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 PLACES = ("task", "recorded", "process", "below")
 
 

@@ -21,6 +21,8 @@ import holdfast
 from tests.checkpoint.test_kills import accepted_under_kills
 from tests.effects.effect_player import WORKERS, program
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 ROOTS = (str(Path(holdfast.__file__).parents[1]), str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH"))
 PATHS = os.pathsep.join(filter(None, ROOTS))
 KILLS = int(os.environ.get("HOLDFAST_EFFECTS", "8"))

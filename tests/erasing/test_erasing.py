@@ -20,6 +20,8 @@ from holdfast.supervision import EndedChildren
 from tests.checkpoint.players import Do, Doer, until
 from tests.erasing.tenants import ACME, OTHER, Doc, Get, Parse, Place, Put, fill, nothing, read, tenant, tenants
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 SCRIPT = Path(__file__).with_name("tenants.py")
 PATHS = os.pathsep.join(
     filter(None, (str(Path(holdfast.__file__).parents[1]), str(SCRIPT.parents[2]), os.environ.get("PYTHONPATH")))

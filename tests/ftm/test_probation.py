@@ -31,7 +31,7 @@ from tests.ftm.test_failover import two_again
 from tests.ftm.test_subtree import bank
 
 # Processes do not care which event loop the root has.
-pytestmark = pytest.mark.asyncio(loop_factories=["uvloop"])
+pytestmark = [pytest.mark.asyncio(loop_factories=["uvloop"]), pytest.mark.usefixtures("warm_programs")]
 
 
 PATHS = os.pathsep.join(filter(None, [str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")]))

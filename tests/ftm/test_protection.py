@@ -20,7 +20,7 @@ from tests.ftm.accounts import Counter, Total
 from tests.ftm.test_failover import pid_of, two_again
 
 # Processes do not care which event loop the root has.
-pytestmark = pytest.mark.asyncio(loop_factories=["uvloop"])
+pytestmark = [pytest.mark.asyncio(loop_factories=["uvloop"]), pytest.mark.usefixtures("warm_programs")]
 
 
 async def whole(system: hf.ActorSystem, ref: hf.ActorRef[Counter], wanted: bool) -> hf.ftm.ProtectionStatus:

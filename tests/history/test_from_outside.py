@@ -15,7 +15,10 @@ from holdfast.console.endpoint import control_endpoint
 from holdfast.console.remote import RemoteSystem
 from holdfast.console.wire import AskHistory
 from holdfast.system.history.pages import HistoryQuestion
+from tests.console.commands import holdfast
 from tests.history.players import Do, Worker, failed, until
+
+pytestmark = pytest.mark.usefixtures("warm_programs")
 
 T = TypeVar("T")
 
@@ -49,13 +52,7 @@ async def far(path: Path, work: Callable[[RemoteSystem], T]) -> T:
 
 async def command(path: Path, *arguments: str) -> tuple[int, str, str]:
     """What a command of the command line says."""
-    process = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-m", "holdfast.console.cli", *arguments, "--socket", str(path)),
-        stdout=asyncio.subprocess.PIPE,
-        stderr=asyncio.subprocess.PIPE,
-    )
-    out, err = await process.communicate()
-    return process.returncode or 0, out.decode(), err.decode()
+    return await holdfast(*arguments, "--socket", path)
 
 
 async def test_the_same_is_known_from_outside(system: hf.ActorSystem, path: Path) -> None:

@@ -22,6 +22,8 @@ from tests.actors.process.players import Run, Worker
 from tests.actors.process.waiting import next_event, until
 from tests.console.commands import holdfast
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 
 async def worker_of(system: hf.ActorSystem, name: str = "worker") -> hf.ActorRef[Worker]:
     return await system.start(hf.child(name, hf.start(Worker), isolation="process"))

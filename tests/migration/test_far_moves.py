@@ -8,7 +8,6 @@ import dataclasses
 import os
 import random
 import signal
-import sys
 import time
 from collections.abc import AsyncGenerator
 from contextlib import asynccontextmanager
@@ -25,8 +24,11 @@ from holdfast.supervision.admin import RemoveChild
 from tests.actors.process.waiting import next_event
 from tests.migration.far_places import IN_TIME, PLACES, Pump, pid_of, processes, traveller
 from tests.migration.travellers import KINDS, Add, Luggage, Seen, Stream, Traveller
+from tests.programs import kills_itself
 from tests.system.test_transaction_commit import Die
 from tests.system.trees import Stumble
+
+pytestmark = pytest.mark.usefixtures("warm_programs")
 
 WAYS = {"far to near": ("far", "near"), "near to far": ("near", "far"), "far to far": ("far", "other")}
 
@@ -155,6 +157,7 @@ PROGRAM = """
 import asyncio, sys
 from tests.migration.test_far_moves import killed
 
+
 if __name__ == "__main__":
     asyncio.run(killed(*sys.argv[1:]))
 """
@@ -169,11 +172,7 @@ async def test_a_root_that_is_killed_has_it_at_one_of_the_two(
 ) -> None:
     (tmp_path / "program.py").write_text(PROGRAM)
     old, new = WAYS[way]
-    here = str(Path(__file__).parents[2])
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, [here, os.environ.get("PYTHONPATH")]))}
-    arguments = (str(tmp_path / "program.py"), str(tmp_path / "store"), when, old, new, isolation)
-    process = await asyncio.create_subprocess_exec(sys.executable, *arguments, env=environment)
-    assert await asyncio.wait_for(process.wait(), IN_TIME) == -signal.SIGKILL
+    await kills_itself(tmp_path / "program.py", tmp_path / "store", when, old, new, isolation, timeout=IN_TIME)
     async with program(str(tmp_path / "store"), old, isolation) as system:
         at = new if when in ("finish", "settled") else old
         ref = system.ref(f"/app/{at}/one", Traveller)

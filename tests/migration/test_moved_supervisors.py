@@ -37,6 +37,8 @@ from tests.migration.ways import (
 )
 from tests.system.trees import Stumble
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 # A refused or failed transaction ends with its block, which collects several steps.
 # ruff: noqa: PT012
 

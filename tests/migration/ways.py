@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import asyncio
 import os
-import signal
-import sys
 from pathlib import Path
 from typing import Any
 
 import holdfast as hf
 from tests.migration.far_places import IN_TIME
+from tests.programs import kills_itself
 from tests.system.test_transaction_commit import Die
 
 HOMES: dict[str, Any] = {"near": "task", "next": "task", "far": "process", "other": "process"}
@@ -88,11 +86,7 @@ async def dies(folder: Path, module: str, *arguments: str) -> None:
         f"import asyncio, sys\nfrom {module} import killed\n\n"
         'if __name__ == "__main__":\n    asyncio.run(killed(*sys.argv[1:]))\n'
     )
-    here = str(Path(__file__).parents[2])
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, [here, os.environ.get("PYTHONPATH")]))}
-    command = (str(program), str(folder / "store"), *arguments)
-    process = await asyncio.create_subprocess_exec(sys.executable, *command, env=environment)
-    assert await asyncio.wait_for(process.wait(), IN_TIME) == -signal.SIGKILL
+    await kills_itself(program, folder / "store", *arguments, timeout=IN_TIME)
 
 
 def check_is_where(system: hf.ActorSystem, when: str, way: str) -> None:

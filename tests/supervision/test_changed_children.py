@@ -18,6 +18,8 @@ from holdfast.supervision.spec import Isolation
 from tests.checkpoint.players import until
 from tests.supervision import changes_player as player
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 
 @pytest.fixture(autouse=True)
 def brief_probation(monkeypatch: pytest.MonkeyPatch) -> None:

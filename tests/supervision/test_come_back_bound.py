@@ -29,6 +29,8 @@ from tests.supervision.come_back_player import (
     program,
 )
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 ROOT = Path(__file__).parents[2]
 PLACES = ["earlier", "later", "other"]
 SILENT = (hf.events.ChildStartFailed, hf.events.ChildRestarted, hf.events.SupervisorGaveUp, hf.events.BindingAwaited)

@@ -18,6 +18,8 @@ from tests.checkpoint.strikes import event
 from tests.checkpoint.trees import running
 from tests.control.players import Account, Total
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 
 class Pupil(hf.Actor):
     """Has a name, and learns words."""

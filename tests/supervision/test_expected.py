@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import os
 import signal
-import sys
 from pathlib import Path
 
 import pytest
@@ -17,6 +15,7 @@ import pytest
 import holdfast as hf
 from holdfast.console.service.health import Service
 from holdfast.testing import GuardedSystem, Simulation, advance, simulate
+from tests.programs import ended
 from tests.supervision.expected_player import (
     KINDS,
     PATH,
@@ -36,6 +35,8 @@ from tests.supervision.expected_player import (
     let_come,
     program,
 )
+
+pytestmark = pytest.mark.usefixtures("warm_programs")
 
 ROOT = Path(__file__).parents[2]
 
@@ -113,11 +114,7 @@ async def test_what_they_are_told_meanwhile_is_kept(by: str, end: str, tmp_path:
         await system.start(hf.dynamic("guests", journal=True))
         await add(system, "recorded", "bound", file)
     player = str(Path(__file__).with_name("expected_player.py"))
-    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
-    ended = await asyncio.create_subprocess_exec(
-        sys.executable, player, store, by, end, env={**os.environ, "PYTHONPATH": path}
-    )
-    assert await ended.wait() == (-signal.SIGKILL if end == "kill" else 0)
+    assert await ended(player, store, by, end) == (-signal.SIGKILL if end == "kill" else 0)
     async with program(store) as system:
         await come(system)
         await let_come(system, "bound", file)

@@ -15,6 +15,8 @@ import holdfast as hf
 from holdfast.testing import idle
 from tests.supervision.registry_player import METHODS, End, Enter, Hits, Leave, Member, Names, found, house
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 ROOT = Path(__file__).parents[2]
 RECORDED = [name for name in METHODS if name != "plain"]
 MEMBER = [("member", 7)]

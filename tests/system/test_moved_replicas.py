@@ -6,7 +6,6 @@ import asyncio
 import dataclasses
 import os
 import signal
-import sys
 import time
 from collections.abc import AsyncGenerator
 from contextlib import asynccontextmanager
@@ -24,9 +23,12 @@ from holdfast.ftm.group import probation
 from holdfast.ftm.model.mechanism import Mechanism, Role
 from holdfast.ftm.sec.authority import CertificationAuthority
 from tests.ftm.bad_bricks import Wrong
+from tests.programs import kills_itself
 from tests.system.test_moved_ties import Heard, Party, Tie, hears_once
 from tests.system.test_transaction_commit import Die
 from tests.system.trees import counter
+
+pytestmark = pytest.mark.usefixtures("warm_programs")
 
 IN_TIME = 30.0
 
@@ -747,6 +749,7 @@ PROGRAM = """
 import asyncio, sys
 from tests.system.test_moved_replicas import killed
 
+
 if __name__ == "__main__":
     asyncio.run(killed(*sys.argv[1:]))
 """
@@ -756,12 +759,9 @@ if __name__ == "__main__":
 @pytest.mark.parametrize("when", ["prepare", "commit", "finish"])
 async def test_a_root_that_is_killed_has_it_at_one_of_the_two(tmp_path: Path, when: str, how: str) -> None:
     (tmp_path / "program.py").write_text(PROGRAM)
-    here = str(Path(__file__).parents[2])
-    above = os.pathsep.join(filter(None, [here, os.environ.get("PYTHONPATH")]))
-    environment = {**os.environ, "PYTHONPATH": above, "TMPDIR": str(tmp_path)}  # It leaves its keys.
-    arguments = (str(tmp_path / "program.py"), str(tmp_path / "store"), when, how)
-    process = await asyncio.create_subprocess_exec(sys.executable, *arguments, env=environment)
-    assert await asyncio.wait_for(process.wait(), 60) == -signal.SIGKILL
+    await kills_itself(
+        tmp_path / "program.py", tmp_path / "store", when, how, TMPDIR=str(tmp_path)
+    )  # It leaves its keys.
     async with program(DECLARED[how], "recorded", tmp_path / "store") as system:
         at, empty = ("there", "here") if when == "finish" else ("here", "there")
         assert "one" not in (system.ref(f"/app/{empty}", hf.Actor)._cell.children or {})

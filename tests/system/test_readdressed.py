@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
-import sys
 import time
 from collections.abc import AsyncGenerator
 from contextlib import asynccontextmanager
@@ -15,8 +14,11 @@ from typing import Any
 import pytest
 
 import holdfast as hf
+from tests.programs import kills_itself
 from tests.system.test_transaction_commit import Die
 from tests.system.trees import Add, Counter, Stumble, counter, ref
+
+pytestmark = pytest.mark.usefixtures("warm_programs")
 
 IN_TIME = 30.0
 RECORDED = hf.hybrid(interval=900.0)
@@ -465,6 +467,7 @@ PROGRAM = """
 import asyncio, sys
 from tests.system.test_readdressed import killed
 
+
 if __name__ == "__main__":
     asyncio.run(killed(*sys.argv[1:]))
 """
@@ -476,11 +479,7 @@ async def test_a_root_that_is_killed_has_it_at_one_of_the_two_with_its_state(
     tmp_path: Path, when: str, isolation: str
 ) -> None:
     (tmp_path / "program.py").write_text(PROGRAM)
-    here = str(Path(__file__).parents[2])
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, [here, os.environ.get("PYTHONPATH")]))}
-    arguments = (str(tmp_path / "program.py"), str(tmp_path / "store"), when, isolation)
-    process = await asyncio.create_subprocess_exec(sys.executable, *arguments, env=environment)
-    assert await asyncio.wait_for(process.wait(), 60) == -signal.SIGKILL
+    await kills_itself(tmp_path / "program.py", tmp_path / "store", when, isolation)
     async with program(tmp_path / "store", isolation) as system:
         at, empty = ("there", "here") if when == "finish" else ("here", "there")
         assert "one" in (ref(system, f"/app/{at}")._cell.children or {})

@@ -6,7 +6,6 @@ import asyncio
 import dataclasses
 import os
 import signal
-import sys
 from collections.abc import AsyncGenerator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -18,8 +17,11 @@ import holdfast as hf
 from holdfast.ftm.mechanisms.pbr import PBR
 from holdfast.ftm.mechanisms.tr import TR
 from holdfast.system.specification import SpecificationNotKept, SpecificationSuperseded
+from tests.programs import kills_itself
 from tests.system.test_transaction_commit import Die, plus
 from tests.system.trees import Add, Client, Counter, Double, Stumble, Where, counter, ref
+
+pytestmark = pytest.mark.usefixtures("warm_programs")
 
 IN_TIME = 20.0
 RECORDED = hf.hybrid(interval=900.0)
@@ -414,6 +416,7 @@ PROGRAM = """
 import asyncio, sys
 from tests.system.test_specification import killed, on_trial
 
+
 if __name__ == "__main__":
     asyncio.run({"killed": killed, "on_trial": on_trial}[sys.argv[1]](*sys.argv[2:]))
 """
@@ -430,12 +433,7 @@ async def on_trial(store: str) -> None:
 
 async def until_killed(tmp_path: Path, *arguments: str) -> None:
     (tmp_path / "program.py").write_text(PROGRAM)
-    here = str(Path(__file__).parents[2])
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, [here, os.environ.get("PYTHONPATH")]))}
-    process = await asyncio.create_subprocess_exec(
-        sys.executable, str(tmp_path / "program.py"), *arguments, env=environment
-    )
-    assert await asyncio.wait_for(process.wait(), 60) == -signal.SIGKILL
+    await kills_itself(tmp_path / "program.py", *arguments)
 
 
 @pytest.mark.asyncio(loop_factories=["uvloop"])

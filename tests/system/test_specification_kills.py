@@ -9,16 +9,22 @@ import asyncio
 import os
 import random
 import signal
+import subprocess
 import sys
 from collections.abc import AsyncGenerator
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 import holdfast as hf
 from holdfast.system.transaction.arrangement import Arrangement
 from holdfast.system.transaction.draft import Draft
+from tests.programs import environment
 from tests.system.trees import Add, Client, Counter, Double, counter, ref
+
+pytestmark = pytest.mark.usefixtures("warm_programs")
 
 KILLS = int(os.environ.get("HOLDFAST_ROOTS", "6"))
 SEED = int(os.environ.get("HOLDFAST_SEED", "1"))
@@ -125,6 +131,7 @@ PROGRAM = """
 import asyncio, sys
 from tests.system.test_specification_kills import changing
 
+
 if __name__ == "__main__":
     asyncio.run(changing(sys.argv[1], sys.argv[2], int(sys.argv[3])))
 """
@@ -134,20 +141,18 @@ async def test_the_tree_is_as_before_or_as_after_the_last_transaction_whenever_t
     tmp_path: Path,
 ) -> None:
     (tmp_path / "program.py").write_text(PROGRAM)
-    here = str(Path(__file__).parents[2])
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, [here, os.environ.get("PYTHONPATH")]))}
     dice, store, log = random.Random(SEED), str(tmp_path / "store"), tmp_path / "log"
     carried_out = 0
     for kill in range(KILLS):
         seed = SEED * 100_000 + kill
         arguments = (str(tmp_path / "program.py"), store, str(log), str(seed))
-        process = await asyncio.create_subprocess_exec(sys.executable, *arguments, env=environment)
+        process = subprocess.Popen([sys.executable, *arguments], env=environment())
         async with asyncio.timeout(60):
             while not (log.exists() and log.read_text()):
                 await asyncio.sleep(0.005)
         await asyncio.sleep(dice.uniform(0.0, LONGEST))
         process.send_signal(signal.SIGKILL)
-        assert await process.wait() == -signal.SIGKILL, f"seed {seed}: it has ended by itself"
+        assert await asyncio.to_thread(process.wait) == -signal.SIGKILL, f"seed {seed}: it has ended by itself"
         told = [line.split("\t") for line in log.read_text().split("\n")[:-1]]
         log.unlink()
         is_over = len(told[-1]) == 1 or told[-1][0] == "0"

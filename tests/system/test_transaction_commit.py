@@ -7,7 +7,6 @@ import contextlib
 import dataclasses
 import os
 import signal
-import sys
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,10 @@ import pytest
 import holdfast as hf
 from holdfast.actors.kernel.cell import DOWN
 from holdfast.system.transaction.draft import difference
+from tests.programs import kills_itself
 from tests.system.trees import Add, Boom, Client, Counter, Double, Life, Stumble, Where, counter, picture, ref
+
+pytestmark = pytest.mark.usefixtures("warm_programs")
 
 # A transaction that fails ends with its block, which collects several steps.
 # ruff: noqa: PT012
@@ -854,6 +856,7 @@ PROGRAM = """
 import asyncio, sys
 from tests.system.test_transaction_commit import accounts
 
+
 if __name__ == "__main__":
     asyncio.run(accounts(*sys.argv[1:]))
 """
@@ -866,11 +869,7 @@ async def test_a_root_that_is_killed_comes_back_with_all_states_or_none(
 ) -> None:
     store, program = str(tmp_path / "store"), tmp_path / "program.py"
     program.write_text(PROGRAM)
-    path = os.pathsep.join([str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")])
-    environment = {**os.environ, "PYTHONPATH": path}
-    args = (sys.executable, str(program), store, when, isolation)
-    dying = await asyncio.create_subprocess_exec(*args, env=environment)
-    assert await asyncio.wait_for(dying.wait(), 60) == -signal.SIGKILL
+    await kills_itself(program, store, when, isolation)
     both = {"prepare": [(1000, 1000)], "commit": [(1000, 1000)], "finish": [(900, 1100)]}
     assert await accounts(store, "", isolation) in both[when]
 

@@ -26,6 +26,8 @@ from tests.checkpoint.sqlite.stores import edit, end, inputs
 from tests.checkpoint.store_tools.writing import acknowledged, begin_writing, environment, everything, filled, run
 from tests.effects.patient import IN_TIME, Call, Go, patient
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 SEED = int(os.environ.get("HOLDFAST_SEED", "1"))
 
 
@@ -163,6 +165,7 @@ async def test_the_classes_of_the_program_need_not_be_there(tmp_path: Path) -> N
     script = """
 import json, sys
 from holdfast.checkpoint.store_tools import export_store
+
 records = [record for record in export_store(sys.argv[1]) if record["record"] != "store"]
 assert not any("test_contents" in name for name in sys.modules)
 print(json.dumps(records))

@@ -39,6 +39,8 @@ from tests.checkpoint.store_tools.writing import (
     written,
 )
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 SEED = int(os.environ.get("HOLDFAST_SEED", "1"))
 
 
@@ -287,6 +289,7 @@ ROOT = """
 import asyncio, os, sys
 import holdfast as hf
 from tests.checkpoint.players import Doer, Note
+
 
 async def main():
     async with hf.ActorSystem("app", store="sqlite:" + sys.argv[1], log=False) as system:

@@ -12,6 +12,8 @@ import pytest
 from tests.checkpoint.store_tools.writing import everything
 from tests.system.upgrade.shops import SESSIONS, begin, check, environment, killed, newer
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 ALICE, LEDGER, TRIP, SEARCH, ROOM = "/app/bank/alice", "/app/ledger", "/app/trip", "/app/search", "/app/rooms/one"
 ALL = {ALICE, LEDGER, TRIP, SEARCH, ROOM}
 
