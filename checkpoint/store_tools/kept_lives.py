@@ -36,13 +36,13 @@ def kept_lives(homes: Homes, path: str) -> list[KeptLife]:
     Raises:
         DamagedStore: none can be trusted. HoldfastError: it is of a format that this holdfast does not know.
     """
-    found: list[KeptLife] = []
-    while not found or found[-1].meta is not None:
-        saved = homes.journal.load(path, older=len(found))
-        if found and saved.snapshot == found[-1].saved.snapshot:
+    kept: list[Saved] = []
+    while not kept or kept[-1].snapshot is not None:
+        saved = homes.journal.load(path, older=len(kept))
+        if kept and saved.snapshot == kept[-1].snapshot:
             break  # There is no older one.
-        found.append(_whole(homes, path, saved))
-    return found[::-1]
+        kept.append(saved)
+    return [_whole(homes, path, saved) for saved in reversed(kept)]
 
 
 def _whole(homes: Homes, path: str, saved: Saved) -> KeptLife:

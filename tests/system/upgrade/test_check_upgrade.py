@@ -10,7 +10,7 @@ from typing import NamedTuple
 import pytest
 
 from tests.checkpoint.store_tools.writing import everything
-from tests.system.upgrade.shops import SESSIONS, begin, check, environment, killed, newer
+from tests.system.upgrade.shops import SESSIONS, begin, check, environment, killed, newer, replay
 
 pytestmark = pytest.mark.usefixtures("warm_programs")
 
@@ -253,3 +253,64 @@ def test_the_children_of_whom_their_supervisor_was_given_another_template_are_ch
         f"/app/{name}": "fine" for name in ("team/one", "team/two", "team/three", "others/guest")
     }
     assert ended == 0
+
+
+MAP = """
+import holdfast as hf
+import numpy as np
+
+
+class Put(hf.Message[int]):
+    at: int
+
+
+class Grid(hf.Actor):
+    def __init__(self) -> None:
+        self.cells = np.zeros((1000, 400), np.float32)
+        self.count = 0
+
+    @hf.on(Put)
+    def put(self, message: Put) -> int:
+        self.cells[message.at] += 1
+        self.count += 1
+        return self.count
+
+
+def tree(isolation="task"):
+    return hf.child("grid", hf.start(Grid), isolation=isolation, recovery=hf.hybrid(interval=3600.0))
+"""
+MAPPED = """
+import asyncio, sys
+import holdfast as hf
+from grid import Put, tree
+
+
+async def main(store: str, isolation: str, snapshots: int) -> None:
+    async with hf.ActorSystem("app", store=store, log=False) as system:
+        grid = await system.start(tree(isolation))
+        for n in range(snapshots):
+            await grid.ask(Put(n))
+            await system.checkpoint(grid)
+        await grid.ask(Put(snapshots))
+
+
+if __name__ == "__main__":
+    asyncio.run(main(sys.argv[1], sys.argv[2], int(sys.argv[3])))
+"""
+
+
+@pytest.mark.parametrize(("isolation", "snapshots"), [("task", 1), ("process", 3)])
+def test_a_state_whose_snapshots_are_kept_in_blocks_is_checked_and_replayed(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, isolation: str, snapshots: int
+) -> None:
+    (tmp_path / "grid.py").write_text(MAP)
+    (tmp_path / "mapped.py").write_text(MAPPED)
+    store = tmp_path / "app.db"
+    command = [sys.executable, str(tmp_path / "mapped.py"), f"sqlite:{store}", isolation, str(snapshots)]
+    subprocess.run(command, check=True, env=environment(tmp_path), timeout=60.0)
+    status, found, errors = check(monkeypatch, store, tmp_path, spec="grid:tree")
+    assert (status, errors) == (0, "")
+    assert found["/app/grid"]["verdict"] == "fine"
+    status, said, _ = replay(store, tmp_path, "/app/grid", "--spec", "grid:tree")
+    assert status == 0
+    assert f"    count = {snapshots + 1}" in said
