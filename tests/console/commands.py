@@ -1,6 +1,6 @@
 """The command line in a process of its own, for the tests."""
 
-from tests.programs import python
+from tests.launched import python
 
 
 async def holdfast(*arguments: object) -> tuple[int, str, str]:

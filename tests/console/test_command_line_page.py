@@ -14,7 +14,7 @@ import pytest
 from holdfast.console.commands import commands
 from holdfast.console.service.project import write_project
 from tests.console.shown import is_shown, sections, steps
-from tests.programs import python
+from tests.launched import python
 
 pytestmark = pytest.mark.usefixtures("warm_programs")
 

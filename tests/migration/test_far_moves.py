@@ -22,9 +22,9 @@ from holdfast.actors.kernel.message import message_name
 from holdfast.actors.process.wire import frames
 from holdfast.supervision.admin import RemoveChild
 from tests.actors.process.waiting import next_event
+from tests.launched import kills_itself
 from tests.migration.far_places import IN_TIME, PLACES, Pump, pid_of, processes, traveller
 from tests.migration.travellers import KINDS, Add, Luggage, Seen, Stream, Traveller
-from tests.programs import kills_itself
 from tests.system.test_transaction_commit import Die
 from tests.system.trees import Stumble
 

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import holdfast as hf
+from tests.launched import kills_itself
 from tests.migration.far_places import IN_TIME
-from tests.programs import kills_itself
 from tests.system.test_transaction_commit import Die
 
 HOMES: dict[str, Any] = {"near": "task", "next": "task", "far": "process", "other": "process"}

@@ -15,7 +15,7 @@ import pytest
 import holdfast as hf
 from holdfast.console.service.health import Service
 from holdfast.testing import GuardedSystem, Simulation, advance, simulate
-from tests.programs import ended
+from tests.launched import ended
 from tests.supervision.expected_player import (
     KINDS,
     PATH,

@@ -23,7 +23,7 @@ from holdfast.ftm.group import probation
 from holdfast.ftm.model.mechanism import Mechanism, Role
 from holdfast.ftm.sec.authority import CertificationAuthority
 from tests.ftm.bad_bricks import Wrong
-from tests.programs import kills_itself
+from tests.launched import kills_itself
 from tests.system.test_moved_ties import Heard, Party, Tie, hears_once
 from tests.system.test_transaction_commit import Die
 from tests.system.trees import counter

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from tests.programs import kills_itself
+from tests.launched import kills_itself
 from tests.system.test_transaction_commit import Die
 from tests.system.trees import Add, Counter, Stumble, counter, ref
 

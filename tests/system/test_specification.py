@@ -17,7 +17,7 @@ import holdfast as hf
 from holdfast.ftm.mechanisms.pbr import PBR
 from holdfast.ftm.mechanisms.tr import TR
 from holdfast.system.specification import SpecificationNotKept, SpecificationSuperseded
-from tests.programs import kills_itself
+from tests.launched import kills_itself
 from tests.system.test_transaction_commit import Die, plus
 from tests.system.trees import Add, Client, Counter, Double, Stumble, Where, counter, ref
 

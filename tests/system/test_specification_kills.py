@@ -21,7 +21,7 @@ import pytest
 import holdfast as hf
 from holdfast.system.transaction.arrangement import Arrangement
 from holdfast.system.transaction.draft import Draft
-from tests.programs import environment
+from tests.launched import environment
 from tests.system.trees import Add, Client, Counter, Double, counter, ref
 
 pytestmark = pytest.mark.usefixtures("warm_programs")

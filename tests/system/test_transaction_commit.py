@@ -16,7 +16,7 @@ import pytest
 import holdfast as hf
 from holdfast.actors.kernel.cell import DOWN
 from holdfast.system.transaction.draft import difference
-from tests.programs import kills_itself
+from tests.launched import kills_itself
 from tests.system.trees import Add, Boom, Client, Counter, Double, Life, Stumble, Where, counter, picture, ref
 
 pytestmark = pytest.mark.usefixtures("warm_programs")
