@@ -14,7 +14,6 @@ import contextlib
 import dataclasses
 import functools
 import inspect
-import math
 import os
 import random
 import sys
@@ -24,11 +23,12 @@ import warnings
 from collections.abc import Callable, Coroutine, Iterable
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, Final
 from unittest import SkipTest
 
 from ..actors.errors import AskFailed, HoldfastError, SpecError
 from ..actors.kernel.cell import GONE
+from ..actors.kernel.envelope import Ask
 from ..actors.kernel.mailbox import admit_gone
 from ..actors.kernel.node import Node
 from ..actors.kernel.ref import ActorRef, current
@@ -39,6 +39,7 @@ from .guard.leaks import Leaks
 from .guard.loop_leaks import LoopLeaks
 from .guard.loop_methods import LoopMethods
 from .guarded import GuardedSystem, UnexpectedEnd
+from .latencies import Latencies, Latency, LateReplies, Said, What, said_latencies
 from .library_code import is_file_of_library
 from .schedules.bound_names import BoundNames, names_of
 from .schedules.charts import Recorder
@@ -58,7 +59,7 @@ from .schedules.choices import (
     size,
 )
 from .schedules.control import Control, ControlledLoop
-from .schedules.disk import PATH, Latency, NoRootToKill, SimulatedDisk
+from .schedules.disk import PATH, NoRootToKill, SimulatedDisk
 from .schedules.hash_seeds import (
     RANDOM,
     PassesElsewhere,
@@ -72,7 +73,7 @@ from .schedules.hash_seeds import (
 )
 from .schedules.places import Root, inside
 from .schedules.processes import SimulatedWorkers
-from .schedules.shrinking import shrink
+from .schedules.shrinking import Failed, shrink
 from .schedules.strategies import DEPTH, mixed
 from .schedules.strategies import strategy as strategy_of
 from .schedules.time_limits import TimeLimit, is_of_time_limit
@@ -96,9 +97,9 @@ class NotExhausted(UserWarning):
     """An exhaustive search has ended before it had tried every schedule."""
 
 
+OF_STORE: Final[tuple[What, ...]] = ("reads", "writes", "syncs")
+"""What takes time only in a simulated store."""
 Test = Callable[..., Coroutine[Any, Any, None]]
-Seconds = tuple[float, float]
-"""The least and the longest."""
 
 
 class Simulation:
@@ -116,8 +117,8 @@ class Simulation:
 
     is_real = False
 
-    def __init__(self, choices: Choices, latency: Seconds = (0.0, 0.0), sync: Seconds = (0.0, 0.0)) -> None:
-        self.seed, self.latency, self._sync = choices.seed, latency, sync
+    def __init__(self, choices: Choices, latency: Said = 0.0, sync: Latency = 0.0) -> None:
+        self.seed, self._latencies = choices.seed, Latencies(choices, said_latencies(latency, sync))
         self.disk: SimulatedDisk | None = None
         self._store: object = None
         self._roots: list[Root] = []  # each after the first has succeeded one that was killed
@@ -132,6 +133,7 @@ class Simulation:
         self._control: Control | None = None  # There is none before the system has been started.
         self._log = TurnLog(self.trace)
         self._swaps = Swaps()
+        self._over: int | None = None  # after so many turns
         self._ends: list[Callable[[], None]] = []
         self._surroundings = contextlib.ExitStack()
 
@@ -153,9 +155,9 @@ class Simulation:
         assert isinstance(loop, ControlledLoop)
         self._store = options.get("store")  # The marker of the test may name it, too.
         if self._store == PATH:
-            self.disk = SimulatedDisk()
-        elif self._sync != (0.0, 0.0):
-            raise SpecError("simulate", f"sync= is how long a sync of the simulated store takes: give store={PATH!r}")
+            self.disk = SimulatedDisk(loop.hold_up)
+        elif said := next((what for what in OF_STORE if what in self._latencies), None):
+            raise SpecError("simulate", f"{said} of the simulated store would take time: give store={PATH!r}")
 
         def make() -> GuardedSystem:
             if self.disk is not None:
@@ -163,13 +165,17 @@ class Simulation:
             return GuardedSystem(**options)
 
         self._make, self._test, self._looks = make, asyncio.current_task(), looks
-        loop.sync_seconds = Latency(self.choices, "syncs", self._sync)
+        loop.latencies = self._latencies
+        if "replies" in self._latencies:
+            loop.late_replies = LateReplies(loop, self._latencies.of("replies"))
 
         def watch(node: Node) -> None:
             if recorder is not None:
                 self._ends.append(watch_turns(node, recorder))
 
         root = await self._start()
+        if loop.late_replies is not None:
+            self._swaps.put(Ask, "answer", loop.late_replies.delaying(Ask.answer))
         self._control = Control(self.choices, self._log, root.node, loop, on_node=watch)
         return root.system
 
@@ -188,9 +194,6 @@ class Simulation:
             inside.reset(mark)
         root.node, root.is_up = root.system._node, True
         root.system._body = self._test
-        pool = root.system._workers
-        if isinstance(pool, SimulatedWorkers):
-            pool.draw_from(self.choices, self.latency)
         if not self._looks:
             root.system.look_away()
         elif self.world is not None:
@@ -280,8 +283,14 @@ class Simulation:
             raise SpecError(ref.path, "it has no process of its own")
         worker.forked.kill()
 
+    def extent(self) -> tuple[int, int]:
+        """How many turns the test has had before it was over, and of how many actors."""
+        turns = self.trace[: self._over]
+        return len(turns), len({path for path, _ in turns})
+
     def stop_recording(self) -> None:
         """Record no more for the chart: the test is over, and how its actors end is none of it."""
+        self._over = len(self.trace) if self._over is None else self._over
         while self._ends:
             self._ends.pop()()
 
@@ -379,8 +388,8 @@ class SimulationSettings:
     replay: str | None = None
     strategy: str = "mixed"
     depth: int = DEPTH
-    latency: float | Seconds = 0.0
-    sync: float | Seconds = 0.0
+    latency: Said = 0.0
+    sync: Latency = 0.0
     ticks: int = TICKS
     options: dict[str, Any] = dataclasses.field(default_factory=dict)
 
@@ -390,8 +399,7 @@ class SimulationSettings:
         if self.ticks < 1:
             raise ValueError(f"simulate takes one tick or more, not ticks={self.ticks}")
         strategy_of(self.strategy, self.depth)
-        _seconds("latency", self.latency)
-        _seconds("sync", self.sync)
+        said_latencies(self.latency, self.sync)
         if self.replay is not None:
             from_text(parted(self.replay)[0])
 
@@ -459,8 +467,8 @@ def simulate(
     replay: str | None = None,
     strategy: str = "mixed",
     depth: int = DEPTH,
-    latency: float | Seconds = 0.0,
-    sync: float | Seconds = 0.0,
+    latency: Said = 0.0,
+    sync: Latency = 0.0,
     ticks: int = TICKS,
     **options: Any,
 ) -> Any:
@@ -482,8 +490,11 @@ def simulate(
         replay: only this schedule, as a failure has printed it. The option --holdfast-replay FILE says the same.
         strategy: mixed, random, pct, exhaustive, coverage.
         depth: of PCT: how many events have to come in one order for the bug to show.
-        latency: seconds that what an actor's process and the root write to each other takes; (least, longest): drawn.
-        sync: seconds that a sync of the simulated store takes; (least, longest): drawn.
+        latency: seconds that what an actor's process and the root write to each other takes: a number, (least,
+            longest), a distribution of `holdfast.testing.latencies`, or a function that draws them from a
+            `random.Random`. `{"starts": ..., "reads": ...}`: each by what takes it: frames, starts, reads, writes,
+            syncs, replies, timers.
+        sync: as `latency={"syncs": ...}`: seconds that a sync of the simulated store takes.
         ticks: at one moment of virtual time, after which the run is taken to go on there for ever (`NotIdle`). In a
             tick everything that waited at its beginning has its turn: a burst takes as many as it is deep.
         options: for ActorSystem. `store="simulated"`: a store in memory, which outlives the root (`crash_root`).
@@ -495,13 +506,6 @@ def simulate(
     """
     settings = SimulationSettings(seeds, seed, replay, strategy, depth, latency, sync, ticks, options)
     return settings.decorate if test is None else settings.decorate(test)
-
-
-def _seconds(name: str, given: float | Seconds) -> Seconds:
-    least, longest = seconds = given if isinstance(given, tuple) else (given, given)
-    if not 0 <= least <= longest < math.inf:
-        raise SpecError("simulate", f"{name} must be >= 0 seconds, or (least, longest), not {given!r}")
-    return seconds
 
 
 class ScheduleSearch:
@@ -599,8 +603,8 @@ class ScheduleSearch:
             said.options,
             recorder,
             looks=looks,
-            latency=_seconds("latency", said.latency),
-            sync=_seconds("sync", said.sync),
+            latency=said.latency,
+            sync=said.sync,
             ticks=said.ticks,
         )
 
@@ -634,14 +638,14 @@ class ScheduleSearch:
         first: Simulation = failure.__simulation__  # type: ignore[attr-defined]
         seed, kind = first.seed, _kind(failure)
 
-        def fails(taken: Taken) -> Taken | None:
+        def fails(taken: Taken) -> Failed | None:
             try:
                 self._run(repeated(seed, taken))
             except BaseException as error:
                 if not _is_failure(error):
                     raise
                 again: Simulation = error.__simulation__  # type: ignore[attr-defined]
-                return again.choices.kept() if _kind(error) == kind else None
+                return Failed(again.choices.kept(), *again.extent()) if _kind(error) == kind else None
             return None
 
         taken = first.choices.kept()
@@ -829,8 +833,8 @@ def run_schedule(
     recorder: Recorder | None = None,
     *,
     looks: bool = True,
-    latency: Seconds = (0.0, 0.0),
-    sync: Seconds = (0.0, 0.0),
+    latency: Said = 0.0,
+    sync: Latency = 0.0,
     ticks: int = TICKS,
 ) -> Simulation:
     """One run under one schedule. Returns what happened.

@@ -33,6 +33,7 @@ from ..guard.loop_leaks import LoopLeaks
 from ..guarded import GuardedSystem, UnexpectedEnd
 from ..histories.checker import linearizable
 from ..histories.history import History, Model
+from ..latencies import Said
 from ..schedules.bound_names import names_of
 from ..schedules.charts import Recorder
 from ..schedules.charts import as_text as chart_as_text
@@ -67,7 +68,7 @@ class ActorMachine(RuleBasedStateMachine):
     Attributes:
         model: what the history has to obey; None: it is not judged.
         options: for ActorSystem. By default its root allows 100 restarts within its period.
-        latency: of processes, as `simulate` takes it.
+        latency: as `simulate` takes it.
         system: the running system; `system.expect_crashes()` and the like say what is meant to happen.
         history: of all that was asked and told through the machine.
         faults: what `inject` injects.
@@ -75,7 +76,7 @@ class ActorMachine(RuleBasedStateMachine):
 
     model: ClassVar[Model[Any] | None] = None
     options: ClassVar[Mapping[str, Any]] = {}
-    latency: ClassVar[float | tuple[float, float]] = 0.0
+    latency: ClassVar[Said] = 0.0
 
     system: GuardedSystem
     history: History
@@ -85,10 +86,9 @@ class ActorMachine(RuleBasedStateMachine):
         super().__init__()
         self._is_drawn, self._schedule = schedule is None and currently_in_test_context(), schedule
         choices = self._choices_of(schedule)
-        late = self.latency if isinstance(self.latency, tuple) else (self.latency, self.latency)
         self.history = History()
         self._options: dict[str, Any] = {"seed": choices.seed, **OPTIONS, **running.get().options, **self.options}
-        self._simulation = Simulation(choices, late)
+        self._simulation = Simulation(choices, type(self).latency)
         self.faults = self._simulation.faults
         self._choices = choices
         self._recorder = Recorder() if self._is_drawn and current_build_context().is_final else None
