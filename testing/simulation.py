@@ -77,7 +77,7 @@ from .schedules.shrinking import Failed, shrink
 from .schedules.strategies import DEPTH, mixed
 from .schedules.strategies import strategy as strategy_of
 from .schedules.time_limits import TimeLimit, is_of_time_limit
-from .schedules.turn_log import TurnLog
+from .schedules.turn_log import Handled, HandledValues, TurnLog, parting
 from .schedules.world import World
 from .swaps import Swaps
 from .turns import Tracer, watch_turns
@@ -85,8 +85,11 @@ from .wanted import SystemsWanted, running
 
 SEED = "HOLDFAST_SEED"
 """The environment variable that picks one seed for every simulated test of a run."""
-TWICE = 10
-"""Every so manieth run is made twice, to see whether its choices repeat it: the first one, too, and each failure."""
+LOOKS = 10
+"""In every so manieth run each message is looked at."""
+TWICE = {"ci": 10, "nightly": 1}
+"""By profile: every so manieth run is made twice, to see whether its choices repeat it. The first one is, and each that
+fails."""
 REAL_RUNS = 3
 """How often a test is run on a real loop, if nothing else is said."""
 NIGHTLY = 25
@@ -148,7 +151,7 @@ class Simulation:
         return () if self.world is None else tuple(self.world.escaped)
 
     async def begin(
-        self, options: dict[str, Any], recorder: Recorder | None = None, *, looks: bool = True
+        self, options: dict[str, Any], recorder: Recorder | None = None, *, looks: bool = True, notes: bool = False
     ) -> GuardedSystem:
         """Start the system; from here on the seed decides."""
         loop = asyncio.get_running_loop()
@@ -174,6 +177,9 @@ class Simulation:
                 self._ends.append(watch_turns(node, recorder))
 
         root = await self._start()
+        if notes:
+            values = self._log.values = HandledValues(self._log)
+            self._swaps.put(Ask, "answer", values.answering(Ask.answer))
         if loop.late_replies is not None:
             self._swaps.put(Ask, "answer", loop.late_replies.delaying(Ask.answer))
         self._control = Control(self.choices, self._log, root.node, loop, on_node=watch)
@@ -283,6 +289,11 @@ class Simulation:
             raise SpecError(ref.path, "it has no process of its own")
         worker.forked.kill()
 
+    @property
+    def handled(self) -> list[Handled]:
+        """The values of messages and replies, in order, if they were noted."""
+        return [] if self._log.values is None else self._log.values.handled
+
     def extent(self) -> tuple[int, int]:
         """How many turns the test has had before it was over, and of how many actors."""
         turns = self.trace[: self._over]
@@ -313,7 +324,7 @@ class RealRun(Simulation):
         """The world stays as it is."""
 
     async def begin(
-        self, options: dict[str, Any], recorder: Recorder | None = None, *, looks: bool = True
+        self, options: dict[str, Any], recorder: Recorder | None = None, *, looks: bool = True, notes: bool = False
     ) -> GuardedSystem:
         if options.get("store") == PATH:
             folder = self._surroundings.enter_context(tempfile.TemporaryDirectory(prefix="holdfast-"))
@@ -527,6 +538,7 @@ class ScheduleSearch:
         self._strategy, self._named = strategy_of(settings.strategy, settings.depth), settings.strategy
         self._wanted = running.get()
         self._failures = self._wanted.failures()
+        self._twice: int = self._wanted.option("twice") or TWICE[self._wanted.option("profile") or "ci"]
 
     def run(self) -> None:
         """Try the schedules that are asked for; those that have failed the last time come first.
@@ -579,10 +591,11 @@ class ScheduleSearch:
                 self.is_complete = True
                 return
             self.runs += 1
-            simulation = self._try(choices, looks=number % TWICE == 0)
+            looks, is_twice = number % LOOKS == 0, number % self._twice == 0
+            simulation = self._try(choices, looks=looks, notes=is_twice)
             self._learn(simulation)
-            if number % TWICE == 0:
-                self._check_repeats(simulation)
+            if is_twice:
+                self._check_repeats(simulation, looks=looks)
         if self._named == "exhaustive" and self._strategy.choices(0) is not None:
             text = f"{self.runs} schedules were tried, and there are more: raise seeds=, or make the system smaller"
             warnings.warn(text, NotExhausted, stacklevel=3)
@@ -594,7 +607,9 @@ class ScheduleSearch:
         if self._failures is not None:
             self._failures.drop(text)
 
-    def _run(self, choices: Choices, recorder: Recorder | None = None, *, looks: bool = True) -> Simulation:
+    def _run(
+        self, choices: Choices, recorder: Recorder | None = None, *, looks: bool = True, notes: bool = False
+    ) -> Simulation:
         said = self._settings
         return run_schedule(
             self._test,
@@ -603,19 +618,20 @@ class ScheduleSearch:
             said.options,
             recorder,
             looks=looks,
+            notes=notes,
             latency=said.latency,
             sync=said.sync,
             ticks=said.ticks,
         )
 
-    def _try(self, choices: Choices, *, looks: bool = True) -> Simulation:
+    def _try(self, choices: Choices, *, looks: bool = True, notes: bool = False) -> Simulation:
         """One run; a failure is explained.
 
         Raises:
             whatever the test raises.
         """
         try:
-            return self._run(choices, looks=looks)
+            return self._run(choices, looks=looks, notes=notes)
         except BaseException as error:
             if is_of_time_limit(error):
                 error.add_note(
@@ -651,13 +667,9 @@ class ScheduleSearch:
         taken = first.choices.kept()
         recorder = Recorder()
         if fails(taken) is None:
-            try:
-                again = self._run(repeated(seed, taken), recorder)
-            except BaseException as error:
-                if not _is_failure(error):
-                    raise
-                again = error.__simulation__  # type: ignore[attr-defined]
-            difference = _difference(first, again) or f"the run of seed {seed} fails only sometimes"
+            again, more = self._failed(seed, taken, recorder), self._failed(seed, taken)
+            found = _difference(first, again) or _difference(again, more)
+            difference = found or f"the run of seed {seed} fails only sometimes"
             note = "\n".join([_head(seed, None, self._is_of_seed()), *hash_seed_in_words(), str(difference)])
             for line in (note, *self._record(failure, as_text(seed, taken), recorder, note)):
                 failure.add_note(line)
@@ -676,6 +688,16 @@ class ScheduleSearch:
         last: Simulation = shown.__simulation__  # type: ignore[attr-defined]
         shown.add_note(self._note(shown, last, taken, recorder))
         return shown
+
+    def _failed(self, seed: int, taken: Taken, recorder: Recorder | None = None) -> Simulation:
+        """The run of this schedule, with the values of what is handled, whether it fails or not."""
+        try:
+            return self._run(repeated(seed, taken), recorder, notes=True)
+        except BaseException as error:
+            if not _is_failure(error):
+                raise
+            made: Simulation = error.__simulation__  # type: ignore[attr-defined]
+            return made
 
     def _translated(self, seed: int, taken: Taken) -> Taken:
         """The same run, kept by who is held up in it."""
@@ -715,14 +737,14 @@ class ScheduleSearch:
         folder = None if self._failures is None else self._failures.folder()
         return [] if folder is None else _written(folder, failure, text, recorder, note, self._wanted.nodeid)
 
-    def _check_repeats(self, simulation: Simulation) -> None:
+    def _check_repeats(self, simulation: Simulation, *, looks: bool) -> None:
         """Make a run again by its choices.
 
         Raises:
             NotRepeatable: it went another way.
         """
         try:
-            again = self._run(repeated(simulation.seed, simulation.choices.kept()))
+            again = self._run(repeated(simulation.seed, simulation.choices.kept()), looks=looks, notes=True)
         except BaseException as error:
             if not _is_failure(error):
                 raise
@@ -800,15 +822,18 @@ _ASYNCIO = os.path.join(os.path.dirname(asyncio.__file__), "")
 
 def _difference(first: Simulation, again: Simulation) -> NotRepeatable | None:
     """Where two runs by the same choices went different ways; None: nowhere."""
+    escaped = tuple(dict.fromkeys([*first.escaped, *again.escaped]))
+    parts = parting(first.handled, again.handled)
+    if parts is not None and parts[0].is_same_kind(parts[1]):
+        where, one, other = parts[0].differs(parts[1])
+        return NotRepeatable(first.seed, parts[0].turn, one, other, escaped, f"{where} of {parts[0]}")
     ended = ("", "the end of the run")
-    longest = max(len(first.trace), len(again.trace))
-    for number in range(longest):
-        one = first.trace[number] if number < len(first.trace) else ended
-        other = again.trace[number] if number < len(again.trace) else ended
-        if one != other:
-            escaped = tuple(dict.fromkeys([*first.escaped, *again.escaped]))
-            return NotRepeatable(first.seed, number + 1, " ".join(one).strip(), " ".join(other).strip(), escaped)
-    return None
+    for number in range(max(len(first.trace), len(again.trace))):
+        turn = first.trace[number] if number < len(first.trace) else ended
+        then = again.trace[number] if number < len(again.trace) else ended
+        if turn != then:
+            return NotRepeatable(first.seed, number + 1, " ".join(turn).strip(), " ".join(then).strip(), escaped)
+    return None if parts is None else NotRepeatable(first.seed, parts[0].turn, *map(str, parts), escaped)
 
 
 def _in_hypothesis() -> bool:
@@ -833,6 +858,7 @@ def run_schedule(
     recorder: Recorder | None = None,
     *,
     looks: bool = True,
+    notes: bool = False,
     latency: Said = 0.0,
     sync: Latency = 0.0,
     ticks: int = TICKS,
@@ -843,6 +869,7 @@ def run_schedule(
         recorder: draws up what happens.
         latency, sync, ticks: as `simulate` says.
         looks: whether each message is looked at, as `GuardedSystem` does: that takes most of the time of a run.
+        notes: whether the values of messages and replies are noted, to be compared with those of another run.
 
     Raises:
         whatever the test raises; `error.__simulation__` is the run.
@@ -853,7 +880,7 @@ def run_schedule(
             loop = runner.get_loop()
             assert isinstance(loop, ControlledLoop)
             with TimeLimit(loop):
-                runner.run(_run(test, simulation, own, options, recorder, looks))
+                runner.run(_run(test, simulation, own, options, recorder, looks, notes))
     except BaseException as error:
         error.__simulation__ = simulation  # type: ignore[attr-defined]
         raise
@@ -872,7 +899,7 @@ def run_real(test: Test, own: set[str], options: dict[str, Any], seeds: range | 
         simulation = RealRun(Choices(seed))
         try:
             with asyncio.Runner() as runner:
-                runner.run(_run(test, simulation, own, options, None, looks=True))
+                runner.run(_run(test, simulation, own, options, None, looks=True, notes=False))
         except Exception as error:
             error.add_note(
                 f"seed={seed}, on a real loop (--holdfast-real): its faults are the seed's, and nothing else"
@@ -881,7 +908,13 @@ def run_real(test: Test, own: set[str], options: dict[str, Any], seeds: range | 
 
 
 async def _run(
-    test: Any, simulation: Simulation, own: set[str], options: dict[str, Any], recorder: Recorder | None, looks: bool
+    test: Any,
+    simulation: Simulation,
+    own: set[str],
+    options: dict[str, Any],
+    recorder: Recorder | None,
+    looks: bool,
+    notes: bool,
 ) -> None:
     wanted, faults = running.get(), simulation.faults
     leaks, unseen = LoopLeaks(wanted.leaks), list[str]()
@@ -889,7 +922,7 @@ async def _run(
     simulation.enter(asyncio.get_running_loop(), names_of(test))
     try:
         try:
-            system = await simulation.begin(options, recorder, looks=looks)
+            system = await simulation.begin(options, recorder, looks=looks, notes=notes)
             wanted.tell(system)
             try:
                 given = {"system": system, "faults": faults, "simulation": simulation}

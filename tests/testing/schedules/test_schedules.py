@@ -414,6 +414,54 @@ def test_a_thread_of_a_pool_may_ask_what_takes_time() -> None:
     simulate(asks, seeds=20)()
 
 
+class Amount(hf.Message[int]):
+    who: str
+    cents: list[int]
+
+
+DRAWN = itertools.count(1)
+"""What no seed decides."""
+
+
+class Till(hf.Actor):
+    @hf.on(Amount)
+    def amount(self, message: Amount) -> int:
+        return next(DRAWN) if message.who == "nobody" else 0
+
+
+@pytest.mark.parametrize(
+    ("who", "isolation", "recovery"),
+    [
+        ("anna", "task", None),
+        ("nobody", "task", None),
+        ("anna", "process", None),
+        ("nobody", "process", None),
+        ("anna", "task", hf.hybrid()),
+    ],
+    ids=["a message", "a reply", "a message to a process", "a reply of a process", "a recorded message"],
+)
+def test_values_that_do_not_repeat_are_an_error_of_that_run(who: str, isolation: Any, recovery: Any) -> None:
+    """Turns, actors and classes are the same each time."""
+
+    async def counts(system: GuardedSystem) -> None:
+        till = await system.start(hf.child("till", hf.start(Till), isolation=isolation, recovery=recovery))
+        await till.ask(Amount(who, [7, 0 if who == "nobody" else next(DRAWN)]))
+
+    field = "its value of the reply of /app/till to" if who == "nobody" else r"cents\[1\] of /app/till"
+    with pytest.raises(NotRepeatable, match=rf"in turn \d+ {field} Amount was \d+, and the same choices then gave \d+"):
+        simulate(counts, seeds=1)()
+
+
+def test_what_no_codec_takes_is_compared_by_its_class() -> None:
+    async def tells(system: GuardedSystem) -> None:
+        till: Any = system.spawn(hf.start(Till), "till")
+        system.expect_types()
+        no_text: Any = object()
+        await till.ask(Amount(no_text, []))
+
+    simulate(tells, seeds=1)()
+
+
 def test_a_run_that_does_not_repeat_is_an_error_of_that_run() -> None:
     seen: list[int] = []
 
