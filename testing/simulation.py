@@ -33,6 +33,10 @@ from ..actors.kernel.mailbox import admit_gone
 from ..actors.kernel.node import Node
 from ..actors.kernel.ref import ActorRef, current
 from .barrier import waiter_of
+from .charts.causes import leading
+from .charts.chart_html import as_html as chart_as_html
+from .charts.chart_text import as_text as chart_as_text
+from .charts.recorder import Recorder
 from .clock import TICKS
 from .faults import Faults
 from .guard.leaks import Leaks
@@ -42,9 +46,6 @@ from .guarded import GuardedSystem, UnexpectedEnd
 from .latencies import Latencies, Latency, LateReplies, Said, What, said_latencies
 from .library_code import is_file_of_library
 from .schedules.bound_names import BoundNames, names_of
-from .schedules.charts import Recorder
-from .schedules.charts import as_html as chart_as_html
-from .schedules.charts import as_text as chart_as_text
 from .schedules.choices import (
     MOMENT,
     TURN,
@@ -177,6 +178,8 @@ class Simulation:
                 self._ends.append(watch_turns(node, recorder))
 
         root = await self._start()
+        if recorder is not None:
+            self._ends.append(recorder.listen())
         if notes:
             values = self._log.values = HandledValues(self._log)
             self._swaps.put(Ask, "answer", values.answering(Ask.answer))
@@ -725,7 +728,7 @@ class ScheduleSearch:
         )
         lines += [f"struck: {strike}" for strike in simulation.faults.strikes]
         lines += [f"not the seed's: {what}" for what in simulation.escaped]
-        chart = chart_as_text(recorder.rows)
+        chart = chart_as_text(leading(recorder, failure), recorder.rows)
         if chart:
             lines.append(chart)
         if self._failures is not None:
@@ -774,7 +777,8 @@ def _written(folder: Path, failure: BaseException, text: str, recorder: Recorder
     (folder / "failure.txt").write_text("\n".join(said) + "\n", encoding="utf-8")
     schedule, chart = folder / "schedule.txt", folder / "chart.html"
     schedule.write_text(with_hash_seed(text) + "\n", encoding="utf-8")
-    chart.write_text(chart_as_html(recorder.rows, nodeid, note), encoding="utf-8")
+    page = chart_as_html(leading(recorder, failure), recorder.rows, nodeid, note)
+    chart.write_text(page, encoding="utf-8")
     return [
         f"all of it as a chart: {chart}",
         f"repeat it: {before_command()}pytest --holdfast-replay {schedule} '{nodeid}'",
@@ -833,7 +837,7 @@ def _difference(first: Simulation, again: Simulation) -> NotRepeatable | None:
         then = again.trace[number] if number < len(again.trace) else ended
         if turn != then:
             return NotRepeatable(first.seed, number + 1, " ".join(turn).strip(), " ".join(then).strip(), escaped)
-    return None if parts is None else NotRepeatable(first.seed, parts[0].turn, *map(str, parts), escaped)
+    return None if parts is None else NotRepeatable(first.seed, parts[0].turn, str(parts[0]), str(parts[1]), escaped)
 
 
 def _in_hypothesis() -> bool:

@@ -27,6 +27,9 @@ from ...actors.kernel.message import Message
 from ...actors.kernel.ref import DEFAULT_TIMEOUT, ActorRef
 from ...supervision.spec import ChildSpec
 from ..barrier import idle
+from ..charts.causes import leading
+from ..charts.chart_text import as_text as chart_as_text
+from ..charts.recorder import Recorder
 from ..clock import advance
 from ..faults import Faults, Strikes
 from ..guard.loop_leaks import LoopLeaks
@@ -35,8 +38,6 @@ from ..histories.checker import linearizable
 from ..histories.history import History, Model
 from ..latencies import Said
 from ..schedules.bound_names import names_of
-from ..schedules.charts import Recorder
-from ..schedules.charts import as_text as chart_as_text
 from ..schedules.choices import ROUNDS, Choices, Production, as_text, from_text, repeated, require_fit
 from ..schedules.control import ControlledLoop
 from ..schedules.processes import SimulatedWorker
@@ -284,7 +285,7 @@ class ActorMachine(RuleBasedStateMachine):
         finally:
             problems = self._end()
             if has_failed:
-                self._note()
+                self._note(sys.exc_info()[1] or failure)
         try:
             if problems and not has_failed:
                 raise UnexpectedEnd(tuple(problems))
@@ -292,8 +293,8 @@ class ActorMachine(RuleBasedStateMachine):
                 linearizable(self.history, self.model).verify()
             if self._schedule is not None and not has_failed:
                 require_fit(self._schedule, self._choices)
-        except BaseException:
-            self._note()
+        except BaseException as error:
+            self._note(error)
             raise
 
     async def _outcomes(self) -> None:
@@ -329,12 +330,12 @@ class ActorMachine(RuleBasedStateMachine):
         finally:
             self._leaks.close()
 
-    def _note(self) -> None:
+    def _note(self, failure: BaseException | None) -> None:
         """Print how the example went, if it is the one that Hypothesis shows."""
-        if self._recorder is None:
+        if self._recorder is None or failure is None:
             return
         text = as_text(self._choices.seed, self._choices.kept())
         note(f'repeat it outside of Hypothesis with {type(self).__name__}(schedule="{text}")')
-        chart = chart_as_text(self._recorder.rows)
+        chart = chart_as_text(leading(self._recorder, failure), self._recorder.rows)
         if chart:
             note(chart)
