@@ -3,7 +3,8 @@
 It shows what the failing statement of the test looks at (refs, futures of asks, probes, actors), and the actors that
 the error names; if there are none, all that the test has heard. A turn follows from the one that sent what it handles,
 from the earlier turns of the same actor, from the replies that it waited for, from that which set its timer or started
-its actor. A turn that waits for a reply that did not come follows from whatever the one who was asked has done instead.
+its actor. A turn that waits for a reply that did not come follows from whatever the one who was asked has done instead,
+and a turn that is not over at the end from all that it has waited for.
 """
 
 from __future__ import annotations
@@ -29,8 +30,10 @@ def leading(recorder: Recorder, failure: BaseException) -> list[ChartRow]:
     shown = {*_named(recorder, failure)}
     rows = [recorder.last[path] for path in shown if path in recorder.last]
     rows += [order.row for path in shown for order in recorder.orders.get(path, ())]
+    rows += [row for path, row in recorder.heard if path in shown]
     if not rows:
-        rows = [*recorder.heard, *(number for number, row in enumerate(recorder.rows) if row.is_probe)]
+        rows = [row for _, row in recorder.heard]
+        rows += [number for number, row in enumerate(recorder.rows) if row.is_probe]
     found = _behind(recorder, rows) if rows else {*range(len(recorder.rows))}
     led = [row for number, row in enumerate(recorder.rows) if number in found and not row.is_library]
     return led or [row for row in recorder.rows if not row.is_library]
@@ -43,8 +46,8 @@ def _behind(recorder: Recorder, rows: Iterable[int]) -> set[int]:
     for sent in recorder.sent:
         if not sent.is_answered and sent.row >= 0:
             unanswered.setdefault(sent.row, []).append(sent.to)
-    waiting = [(row, NEVER) for row in rows]
-    while waiting:
+    waiting, hanging = [(row, NEVER) for row in rows], recorder.hanging()
+    while waiting or (waiting := [(row, NEVER) for row in hanging if until.get(row, NEVER) < NEVER]):
         number, moment = waiting.pop()
         if until.get(number, -1) >= moment:
             continue
@@ -56,6 +59,7 @@ def _behind(recorder: Recorder, rows: Iterable[int]) -> set[int]:
 
 def _named(recorder: Recorder, failure: BaseException) -> Iterator[str]:
     """The addresses of the actors that a failure is about."""
+    yield from (path for error, path in recorder.refused if error is failure)
     text = str(failure)
     yield from (path for path in paths_in(text) if path in recorder.last or path in recorder.orders)
     frames: list[TracebackType] = []
@@ -114,7 +118,8 @@ def _paths(recorder: Recorder, value: Any, *, is_inside: bool = False) -> Iterat
         case Actor():
             yield value.ctx.path
         case asyncio.Future():
-            yield from (path for future, path in recorder.asks if future is value)
+            if id(value) in recorder.asks:
+                yield recorder.asks[id(value)][1]
         case dict() if not is_inside:
             for one in [*value.values()][:WITHIN]:
                 yield from _paths(recorder, one, is_inside=True)

@@ -31,7 +31,8 @@ def short(path: str) -> str:
 
 def heading(led: Sequence[ChartRow], rows: Sequence[ChartRow]) -> str:
     """How many turns are shown, and what is left out."""
-    last = f"the last {SHOWN} of the {len(led)} turns" if len(led) > SHOWN else f"the {len(led)} turns"
+    count = "1 turn" if len(led) == 1 else f"{len(led)} turns"
+    last = f"the last {SHOWN} of the {count}" if len(led) > SHOWN else f"the {count}"
     chosen = {*map(id, led)}
     others = [row for row in rows if id(row) not in chosen and not row.is_library]
     actors = {row.path for row in others} - {row.path for row in led}
@@ -41,7 +42,7 @@ def heading(led: Sequence[ChartRow], rows: Sequence[ChartRow]) -> str:
     of = f", of {len(actors)} other actor{'' if len(actors) == 1 else 's'} and these" if actors else ""
     if actors and all(row.path in actors for row in others):
         of = f" of {len(actors)} other actor{'' if len(actors) == 1 else 's'}"
-    return f"{last} that lead to it ({turns}{of} left out):"
+    return f"{last} that lead{'s' if len(led) == 1 else ''} to it ({turns}{of} left out):"
 
 
 def as_text(led: Sequence[ChartRow], rows: Sequence[ChartRow]) -> str:

@@ -16,7 +16,7 @@ from ...actors.kernel.actor import Actor
 from ...actors.kernel.cell import Cell, Order
 from ...actors.kernel.codec import Parcel
 from ...actors.kernel.context import ActorContext
-from ...actors.kernel.envelope import Ask, Item
+from ...actors.kernel.envelope import Ask, Item, ReplyHandle
 from ...actors.kernel.lifecycle import FirstTurn
 from ...actors.kernel.loop import TurnRemains
 from ...actors.kernel.message import Message, message_of
@@ -124,19 +124,24 @@ class Recorder(TurnWatcher):
 
     Attributes:
         rows: the turns, in the order in which they began.
-        heard: what the test has got to know: the turns whose replies it got.
+        last: the newest turn of each address.
+        heard: what the test has got to know: whom it has asked, and a turn that has brought the reply.
         asks: the futures that the test has got, with the address that was asked.
+        refused: the errors that asks have ended with, and who was asked.
         sent: all that was asked, for who waits for it.
+        orders: by address, the turns that have ordered its actor to stop.
     """
 
     def __init__(self) -> None:
         self.rows: list[ChartRow] = []
-        self.heard: list[int] = []
-        self.asks: list[tuple[asyncio.Future[Any], str]] = []
+        self.last: dict[str, int] = {}
+        self.heard: list[tuple[str, int]] = []
+        self.asks: dict[int, tuple[asyncio.Future[Any], str]] = {}  # by their ids
+        self.refused: list[tuple[BaseException, str]] = []
         self.sent: list[Sent] = []
-        self.last: dict[str, int] = {}  # the newest turn of each address
         self._moment = 0
-        self.orders: dict[str, list[Cause]] = {}  # by address: the turns that have ordered its actor to stop
+        self.orders: dict[str, list[Cause]] = {}
+        self._asked: dict[int, tuple[Ask, int, Sent | None]] = {}  # by their ids, with the turns that handle them
         self._open: dict[Cell, OpenTurn] = {}
         self._ways: dict[Way, deque[Sent]] = {}
         self._newest: dict[Way, Sent] = {}
@@ -154,6 +159,7 @@ class Recorder(TurnWatcher):
             swaps.put(kind, "forward", self._forwarding(vars(kind)["forward"]))
         swaps.put(ActorRef, "_order", self._ordering(ActorRef._order))
         swaps.put(Ask, "answer", self._answering(Ask.answer))
+        swaps.put(Ask, "fail", self._failing(Ask.fail))
         return swaps.undo
 
     def _sending(self, send: Any, *, is_ask: bool) -> Any:
@@ -163,7 +169,7 @@ class Recorder(TurnWatcher):
             self._note("" if sender is None else sender.path, ref.path, message, is_ask=is_ask)
             made = send(ref, message, *rest, **options)
             if is_ask and sender is None and isinstance(made, asyncio.Future):
-                self.asks.append((made, ref.path))
+                self.asks[id(made)] = made, ref.path
             return made
 
         return noted
@@ -197,13 +203,30 @@ class Recorder(TurnWatcher):
 
         return noted
 
+    def hanging(self) -> list[int]:
+        """The turns that are not over."""
+        return [turn.number for turn in self._open.values()]
+
     def _answering(self, answer: Any) -> Any:
         @functools.wraps(answer)
         def noted(ask: Ask, reply: object) -> None:
-            row = self._row_here()
-            if row >= 0 and not ask.future.done():
-                self._tell(row, "" if ask.sender is None else ask.sender.path)
+            if not isinstance(reply, ReplyHandle) and not ask.future.done():
+                _, number, sent = self._asked.get(id(ask), (ask, -1, None))
+                if sent is not None:
+                    sent.is_answered = True
+                whom = "" if ask.sender is None else ask.sender.path
+                for row in {number, self._row_here()} - {-1}:
+                    self._tell(row, whom, self.asks[id(ask.future)][1] if id(ask.future) in self.asks else "")
             answer(ask, reply)
+
+        return noted
+
+    def _failing(self, fail: Any) -> Any:
+        @functools.wraps(fail)
+        def noted(ask: Ask, error: BaseException) -> None:
+            if ask.to is not None:
+                self.refused.append((error, ask.to.path))
+            fail(ask, error)
 
         return noted
 
@@ -221,11 +244,11 @@ class Recorder(TurnWatcher):
         if is_ask:
             self.sent.append(sent)
 
-    def _tell(self, row: int, to: str) -> None:
-        """What a turn has replied is known to an actor, or to the test."""
+    def _tell(self, row: int, to: str, asked: str) -> None:
+        """What a turn has replied is known to an actor, or to the test, which had asked whom."""
         self._moment += 1
         if not to:
-            self.heard.append(row)
+            self.heard.append((asked, row))
         elif (told_row := self.last.get(to, -1)) >= 0:
             self.rows[told_row].causes.append(Cause(self._moment, row, self._moment))
 
@@ -252,6 +275,8 @@ class Recorder(TurnWatcher):
         if isinstance(item, TurnRemains):
             row.causes += self._behind_error(item.error)
         is_of_user = cell.actor is not None and not is_module_of_library(type(cell.actor).__module__)
+        if type(item) is Ask:
+            self._asked[id(item)] = item, number, sent
         self._open[cell] = OpenTurn(number, cell.life, _state(cell), is_of_user, sent)
         self.last[cell.path] = number
         self.rows.append(row)
@@ -291,9 +316,9 @@ class Recorder(TurnWatcher):
         row.is_probe = isinstance(cell.actor, ProbeActor)
         if row.is_library and isinstance(item, FirstTurn | Fed) and _has_hook(cell.actor):
             row.what, row.is_library = "on_start", False
-        if sent is not None and sent.is_ask and not has_ended:
+        if sent is not None and sent.is_ask and not has_ended and type(item) is not Ask:
             sent.is_answered = True
-            self._tell(turn.number, row.sender)
+            self._tell(turn.number, row.sender, row.path)
 
 
 def paths_in(text: str) -> list[str]:
