@@ -6,7 +6,6 @@ the context is open. Production code has no hooks for it and pays nothing.
 
 from __future__ import annotations
 
-import math
 import random
 from collections.abc import Callable
 from types import TracebackType
@@ -15,7 +14,8 @@ from typing import Any, Literal, NamedTuple, get_args
 from ..actors.errors import HoldfastError, SpecError
 from ..actors.kernel.ref import ActorRef
 from ..system.system import ActorSystem
-from .schedules.choices import DELAY, FAULT, LEVELS, Choices
+from .latencies import Latency, row_of
+from .schedules.choices import DELAY, FAULT, Choices
 
 Kind = Literal["crash", "hang", "delay", "drop", "duplicate", "reorder", "corrupt", "fail"]
 KINDS: tuple[str, ...] = get_args(Kind)
@@ -131,7 +131,7 @@ class Strikes:
         path: str,
         point: Point,
         odds: dict[Kind, float],
-        seconds: float | tuple[float, float],
+        seconds: Latency,
         after: int,
         times: int | None,
         *,
@@ -139,11 +139,11 @@ class Strikes:
     ) -> None:
         self.at, self.path, self.seed = point.name, path, faults.seed
         self.replays = replays
-        self.least, self.longest = seconds if isinstance(seconds, tuple) else (seconds, seconds)
         self.chances = 0
         self.is_over = False
         self.struck: list[Strike] = []
-        self.draw = random.Random(f"{faults.seed}|{path}|{point.name}|{len(faults.installed)}")
+        named = f"{faults.seed}|{path}|{point.name}|{len(faults.installed)}"
+        self.draw, self._row = random.Random(named), row_of("faults", "seconds", seconds, random.Random(f"row {named}"))
         self._faults, self._odds, self._after, self._times = faults, odds, after, times
         self._undo: list[Callable[[], None]] = []
 
@@ -172,12 +172,11 @@ class Strikes:
 
     def delay(self) -> float:
         """Return how long the delay that strikes now is, in seconds."""
-        if self.least == self.longest:
-            return self.least
-        level = self.draw.randrange(LEVELS)
-        if self._faults.choices is not None:
-            level = self._faults.choices.draw(DELAY, LEVELS, level)
-        return self.least + (self.longest - self.least) * level / (LEVELS - 1)
+        count = len(self._row)
+        level = self.draw.randrange(count) if count > 1 else 0
+        if self._faults.choices is not None and count > 1:
+            level = self._faults.choices.draw(DELAY, count, level)
+        return self._row[level]
 
     def crash(self) -> InjectedCrash:
         """Return the exception of a crash that strikes now."""
@@ -233,7 +232,7 @@ class Faults:
         target: ActorRef[Any] | ActorSystem,
         *,
         at: str,
-        seconds: float | tuple[float, float] = 1.0,
+        seconds: Latency = 1.0,
         after: int = 0,
         times: int | None = None,
         replays: bool = False,
@@ -244,8 +243,8 @@ class Faults:
         Args:
             target: the actor; for "process start" the system.
             at: a name in POINTS.
-            seconds: how long a delay is, on the loop's clock; (least, longest): each is drawn. What is reordered comes
-                after the next message, or so much later if there is none.
+            seconds: how long a delay is, on the loop's clock, as a latency of `simulate` is said. What is reordered
+                comes after the next message, or so much later if there is none.
             after: this many chances are let pass first.
             times: at most so many strikes; None: no limit.
             replays: at "turn begin" and "turn end": the turns of a replay are chances, too. Left out, only turns that
@@ -262,8 +261,6 @@ class Faults:
         if point is None:
             raise SpecError("faults", f"at must be one of {', '.join(POINTS)}, not {at!r}")
         strikes = Strikes(self, _path(target), point, _checked(point, odds), seconds, after, times, replays=replays)
-        if not 0 <= strikes.least <= strikes.longest < math.inf:
-            raise SpecError("faults", f"seconds must be >= 0, or (least, longest), not {seconds!r}")
         if replays and at not in TURNS:
             raise SpecError("faults", f"replays=True is for {' and '.join(map(repr, TURNS))}, not for {at!r}")
         INSTALL[at](strikes, target)

@@ -14,7 +14,6 @@ import contextlib
 import dataclasses
 import functools
 import inspect
-import math
 import os
 import random
 import sys
@@ -24,26 +23,29 @@ import warnings
 from collections.abc import Callable, Coroutine, Iterable
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, Final
 from unittest import SkipTest
 
 from ..actors.errors import AskFailed, HoldfastError, SpecError
 from ..actors.kernel.cell import GONE
+from ..actors.kernel.envelope import Ask
 from ..actors.kernel.mailbox import admit_gone
 from ..actors.kernel.node import Node
 from ..actors.kernel.ref import ActorRef, current
 from .barrier import waiter_of
+from .charts.causes import leading
+from .charts.chart_html import as_html as chart_as_html
+from .charts.chart_text import as_text as chart_as_text
+from .charts.recorder import Recorder
 from .clock import TICKS
 from .faults import Faults
 from .guard.leaks import Leaks
 from .guard.loop_leaks import LoopLeaks
 from .guard.loop_methods import LoopMethods
 from .guarded import GuardedSystem, UnexpectedEnd
+from .latencies import Latencies, Latency, LateReplies, Said, What, said_latencies
 from .library_code import is_file_of_library
 from .schedules.bound_names import BoundNames, names_of
-from .schedules.charts import Recorder
-from .schedules.charts import as_html as chart_as_html
-from .schedules.charts import as_text as chart_as_text
 from .schedules.choices import (
     MOMENT,
     TURN,
@@ -58,7 +60,7 @@ from .schedules.choices import (
     size,
 )
 from .schedules.control import Control, ControlledLoop
-from .schedules.disk import PATH, Latency, NoRootToKill, SimulatedDisk
+from .schedules.disk import PATH, NoRootToKill, SimulatedDisk
 from .schedules.hash_seeds import (
     RANDOM,
     PassesElsewhere,
@@ -72,11 +74,11 @@ from .schedules.hash_seeds import (
 )
 from .schedules.places import Root, inside
 from .schedules.processes import SimulatedWorkers
-from .schedules.shrinking import shrink
+from .schedules.shrinking import Failed, shrink
 from .schedules.strategies import DEPTH, mixed
 from .schedules.strategies import strategy as strategy_of
 from .schedules.time_limits import TimeLimit, is_of_time_limit
-from .schedules.turn_log import TurnLog
+from .schedules.turn_log import Handled, HandledValues, TurnLog, parting
 from .schedules.world import World
 from .swaps import Swaps
 from .turns import Tracer, watch_turns
@@ -84,8 +86,11 @@ from .wanted import SystemsWanted, running
 
 SEED = "HOLDFAST_SEED"
 """The environment variable that picks one seed for every simulated test of a run."""
-TWICE = 10
-"""Every so manieth run is made twice, to see whether its choices repeat it: the first one, too, and each failure."""
+LOOKS = 10
+"""In every so manieth run each message is looked at."""
+TWICE = {"ci": 10, "nightly": 1}
+"""By profile: every so manieth run is made twice, to see whether its choices repeat it. The first one is, and each that
+fails."""
 REAL_RUNS = 3
 """How often a test is run on a real loop, if nothing else is said."""
 NIGHTLY = 25
@@ -96,9 +101,9 @@ class NotExhausted(UserWarning):
     """An exhaustive search has ended before it had tried every schedule."""
 
 
+OF_STORE: Final[tuple[What, ...]] = ("reads", "writes", "syncs")
+"""What takes time only in a simulated store."""
 Test = Callable[..., Coroutine[Any, Any, None]]
-Seconds = tuple[float, float]
-"""The least and the longest."""
 
 
 class Simulation:
@@ -116,8 +121,8 @@ class Simulation:
 
     is_real = False
 
-    def __init__(self, choices: Choices, latency: Seconds = (0.0, 0.0), sync: Seconds = (0.0, 0.0)) -> None:
-        self.seed, self.latency, self._sync = choices.seed, latency, sync
+    def __init__(self, choices: Choices, latency: Said = 0.0, sync: Latency = 0.0) -> None:
+        self.seed, self._latencies = choices.seed, Latencies(choices, said_latencies(latency, sync))
         self.disk: SimulatedDisk | None = None
         self._store: object = None
         self._roots: list[Root] = []  # each after the first has succeeded one that was killed
@@ -132,6 +137,7 @@ class Simulation:
         self._control: Control | None = None  # There is none before the system has been started.
         self._log = TurnLog(self.trace)
         self._swaps = Swaps()
+        self._over: int | None = None  # after so many turns
         self._ends: list[Callable[[], None]] = []
         self._surroundings = contextlib.ExitStack()
 
@@ -146,16 +152,16 @@ class Simulation:
         return () if self.world is None else tuple(self.world.escaped)
 
     async def begin(
-        self, options: dict[str, Any], recorder: Recorder | None = None, *, looks: bool = True
+        self, options: dict[str, Any], recorder: Recorder | None = None, *, looks: bool = True, notes: bool = False
     ) -> GuardedSystem:
         """Start the system; from here on the seed decides."""
         loop = asyncio.get_running_loop()
         assert isinstance(loop, ControlledLoop)
         self._store = options.get("store")  # The marker of the test may name it, too.
         if self._store == PATH:
-            self.disk = SimulatedDisk()
-        elif self._sync != (0.0, 0.0):
-            raise SpecError("simulate", f"sync= is how long a sync of the simulated store takes: give store={PATH!r}")
+            self.disk = SimulatedDisk(loop.hold_up)
+        elif said := next((what for what in OF_STORE if what in self._latencies), None):
+            raise SpecError("simulate", f"{said} of the simulated store would take time: give store={PATH!r}")
 
         def make() -> GuardedSystem:
             if self.disk is not None:
@@ -163,13 +169,22 @@ class Simulation:
             return GuardedSystem(**options)
 
         self._make, self._test, self._looks = make, asyncio.current_task(), looks
-        loop.sync_seconds = Latency(self.choices, "syncs", self._sync)
+        loop.latencies = self._latencies
+        if "replies" in self._latencies:
+            loop.late_replies = LateReplies(loop, self._latencies.of("replies"))
 
         def watch(node: Node) -> None:
             if recorder is not None:
                 self._ends.append(watch_turns(node, recorder))
 
         root = await self._start()
+        if recorder is not None:
+            self._ends.append(recorder.listen())
+        if notes:
+            values = self._log.values = HandledValues(self._log)
+            self._swaps.put(Ask, "answer", values.answering(Ask.answer))
+        if loop.late_replies is not None:
+            self._swaps.put(Ask, "answer", loop.late_replies.delaying(Ask.answer))
         self._control = Control(self.choices, self._log, root.node, loop, on_node=watch)
         return root.system
 
@@ -188,9 +203,6 @@ class Simulation:
             inside.reset(mark)
         root.node, root.is_up = root.system._node, True
         root.system._body = self._test
-        pool = root.system._workers
-        if isinstance(pool, SimulatedWorkers):
-            pool.draw_from(self.choices, self.latency)
         if not self._looks:
             root.system.look_away()
         elif self.world is not None:
@@ -280,8 +292,19 @@ class Simulation:
             raise SpecError(ref.path, "it has no process of its own")
         worker.forked.kill()
 
+    @property
+    def handled(self) -> list[Handled]:
+        """The values of messages and replies, in order, if they were noted."""
+        return [] if self._log.values is None else self._log.values.handled
+
+    def extent(self) -> tuple[int, int]:
+        """How many turns the test has had before it was over, and of how many actors."""
+        turns = self.trace[: self._over]
+        return len(turns), len({path for path, _ in turns})
+
     def stop_recording(self) -> None:
         """Record no more for the chart: the test is over, and how its actors end is none of it."""
+        self._over = len(self.trace) if self._over is None else self._over
         while self._ends:
             self._ends.pop()()
 
@@ -304,7 +327,7 @@ class RealRun(Simulation):
         """The world stays as it is."""
 
     async def begin(
-        self, options: dict[str, Any], recorder: Recorder | None = None, *, looks: bool = True
+        self, options: dict[str, Any], recorder: Recorder | None = None, *, looks: bool = True, notes: bool = False
     ) -> GuardedSystem:
         if options.get("store") == PATH:
             folder = self._surroundings.enter_context(tempfile.TemporaryDirectory(prefix="holdfast-"))
@@ -379,8 +402,8 @@ class SimulationSettings:
     replay: str | None = None
     strategy: str = "mixed"
     depth: int = DEPTH
-    latency: float | Seconds = 0.0
-    sync: float | Seconds = 0.0
+    latency: Said = 0.0
+    sync: Latency = 0.0
     ticks: int = TICKS
     options: dict[str, Any] = dataclasses.field(default_factory=dict)
 
@@ -390,8 +413,7 @@ class SimulationSettings:
         if self.ticks < 1:
             raise ValueError(f"simulate takes one tick or more, not ticks={self.ticks}")
         strategy_of(self.strategy, self.depth)
-        _seconds("latency", self.latency)
-        _seconds("sync", self.sync)
+        said_latencies(self.latency, self.sync)
         if self.replay is not None:
             from_text(parted(self.replay)[0])
 
@@ -459,8 +481,8 @@ def simulate(
     replay: str | None = None,
     strategy: str = "mixed",
     depth: int = DEPTH,
-    latency: float | Seconds = 0.0,
-    sync: float | Seconds = 0.0,
+    latency: Said = 0.0,
+    sync: Latency = 0.0,
     ticks: int = TICKS,
     **options: Any,
 ) -> Any:
@@ -482,8 +504,11 @@ def simulate(
         replay: only this schedule, as a failure has printed it. The option --holdfast-replay FILE says the same.
         strategy: mixed, random, pct, exhaustive, coverage.
         depth: of PCT: how many events have to come in one order for the bug to show.
-        latency: seconds that what an actor's process and the root write to each other takes; (least, longest): drawn.
-        sync: seconds that a sync of the simulated store takes; (least, longest): drawn.
+        latency: seconds that what an actor's process and the root write to each other takes: a number, (least,
+            longest), a distribution of `holdfast.testing.latencies`, or a function that draws them from a
+            `random.Random`. `{"starts": ..., "reads": ...}`: each by what takes it: frames, starts, reads, writes,
+            syncs, replies, timers.
+        sync: as `latency={"syncs": ...}`: seconds that a sync of the simulated store takes.
         ticks: at one moment of virtual time, after which the run is taken to go on there for ever (`NotIdle`). In a
             tick everything that waited at its beginning has its turn: a burst takes as many as it is deep.
         options: for ActorSystem. `store="simulated"`: a store in memory, which outlives the root (`crash_root`).
@@ -495,13 +520,6 @@ def simulate(
     """
     settings = SimulationSettings(seeds, seed, replay, strategy, depth, latency, sync, ticks, options)
     return settings.decorate if test is None else settings.decorate(test)
-
-
-def _seconds(name: str, given: float | Seconds) -> Seconds:
-    least, longest = seconds = given if isinstance(given, tuple) else (given, given)
-    if not 0 <= least <= longest < math.inf:
-        raise SpecError("simulate", f"{name} must be >= 0 seconds, or (least, longest), not {given!r}")
-    return seconds
 
 
 class ScheduleSearch:
@@ -523,6 +541,7 @@ class ScheduleSearch:
         self._strategy, self._named = strategy_of(settings.strategy, settings.depth), settings.strategy
         self._wanted = running.get()
         self._failures = self._wanted.failures()
+        self._twice: int = self._wanted.option("twice") or TWICE[self._wanted.option("profile") or "ci"]
 
     def run(self) -> None:
         """Try the schedules that are asked for; those that have failed the last time come first.
@@ -575,10 +594,11 @@ class ScheduleSearch:
                 self.is_complete = True
                 return
             self.runs += 1
-            simulation = self._try(choices, looks=number % TWICE == 0)
+            looks, is_twice = number % LOOKS == 0, number % self._twice == 0
+            simulation = self._try(choices, looks=looks, notes=is_twice)
             self._learn(simulation)
-            if number % TWICE == 0:
-                self._check_repeats(simulation)
+            if is_twice:
+                self._check_repeats(simulation, looks=looks)
         if self._named == "exhaustive" and self._strategy.choices(0) is not None:
             text = f"{self.runs} schedules were tried, and there are more: raise seeds=, or make the system smaller"
             warnings.warn(text, NotExhausted, stacklevel=3)
@@ -590,7 +610,9 @@ class ScheduleSearch:
         if self._failures is not None:
             self._failures.drop(text)
 
-    def _run(self, choices: Choices, recorder: Recorder | None = None, *, looks: bool = True) -> Simulation:
+    def _run(
+        self, choices: Choices, recorder: Recorder | None = None, *, looks: bool = True, notes: bool = False
+    ) -> Simulation:
         said = self._settings
         return run_schedule(
             self._test,
@@ -599,19 +621,20 @@ class ScheduleSearch:
             said.options,
             recorder,
             looks=looks,
-            latency=_seconds("latency", said.latency),
-            sync=_seconds("sync", said.sync),
+            notes=notes,
+            latency=said.latency,
+            sync=said.sync,
             ticks=said.ticks,
         )
 
-    def _try(self, choices: Choices, *, looks: bool = True) -> Simulation:
+    def _try(self, choices: Choices, *, looks: bool = True, notes: bool = False) -> Simulation:
         """One run; a failure is explained.
 
         Raises:
             whatever the test raises.
         """
         try:
-            return self._run(choices, looks=looks)
+            return self._run(choices, looks=looks, notes=notes)
         except BaseException as error:
             if is_of_time_limit(error):
                 error.add_note(
@@ -634,26 +657,22 @@ class ScheduleSearch:
         first: Simulation = failure.__simulation__  # type: ignore[attr-defined]
         seed, kind = first.seed, _kind(failure)
 
-        def fails(taken: Taken) -> Taken | None:
+        def fails(taken: Taken) -> Failed | None:
             try:
                 self._run(repeated(seed, taken))
             except BaseException as error:
                 if not _is_failure(error):
                     raise
                 again: Simulation = error.__simulation__  # type: ignore[attr-defined]
-                return again.choices.kept() if _kind(error) == kind else None
+                return Failed(again.choices.kept(), *again.extent()) if _kind(error) == kind else None
             return None
 
         taken = first.choices.kept()
         recorder = Recorder()
         if fails(taken) is None:
-            try:
-                again = self._run(repeated(seed, taken), recorder)
-            except BaseException as error:
-                if not _is_failure(error):
-                    raise
-                again = error.__simulation__  # type: ignore[attr-defined]
-            difference = _difference(first, again) or f"the run of seed {seed} fails only sometimes"
+            again, more = self._failed(seed, taken, recorder), self._failed(seed, taken)
+            found = _difference(first, again) or _difference(again, more)
+            difference = found or f"the run of seed {seed} fails only sometimes"
             note = "\n".join([_head(seed, None, self._is_of_seed()), *hash_seed_in_words(), str(difference)])
             for line in (note, *self._record(failure, as_text(seed, taken), recorder, note)):
                 failure.add_note(line)
@@ -672,6 +691,16 @@ class ScheduleSearch:
         last: Simulation = shown.__simulation__  # type: ignore[attr-defined]
         shown.add_note(self._note(shown, last, taken, recorder))
         return shown
+
+    def _failed(self, seed: int, taken: Taken, recorder: Recorder | None = None) -> Simulation:
+        """The run of this schedule, with the values of what is handled, whether it fails or not."""
+        try:
+            return self._run(repeated(seed, taken), recorder, notes=True)
+        except BaseException as error:
+            if not _is_failure(error):
+                raise
+            made: Simulation = error.__simulation__  # type: ignore[attr-defined]
+            return made
 
     def _translated(self, seed: int, taken: Taken) -> Taken:
         """The same run, kept by who is held up in it."""
@@ -699,7 +728,7 @@ class ScheduleSearch:
         )
         lines += [f"struck: {strike}" for strike in simulation.faults.strikes]
         lines += [f"not the seed's: {what}" for what in simulation.escaped]
-        chart = chart_as_text(recorder.rows)
+        chart = chart_as_text(leading(recorder, failure), recorder.rows)
         if chart:
             lines.append(chart)
         if self._failures is not None:
@@ -711,14 +740,14 @@ class ScheduleSearch:
         folder = None if self._failures is None else self._failures.folder()
         return [] if folder is None else _written(folder, failure, text, recorder, note, self._wanted.nodeid)
 
-    def _check_repeats(self, simulation: Simulation) -> None:
+    def _check_repeats(self, simulation: Simulation, *, looks: bool) -> None:
         """Make a run again by its choices.
 
         Raises:
             NotRepeatable: it went another way.
         """
         try:
-            again = self._run(repeated(simulation.seed, simulation.choices.kept()))
+            again = self._run(repeated(simulation.seed, simulation.choices.kept()), looks=looks, notes=True)
         except BaseException as error:
             if not _is_failure(error):
                 raise
@@ -748,7 +777,8 @@ def _written(folder: Path, failure: BaseException, text: str, recorder: Recorder
     (folder / "failure.txt").write_text("\n".join(said) + "\n", encoding="utf-8")
     schedule, chart = folder / "schedule.txt", folder / "chart.html"
     schedule.write_text(with_hash_seed(text) + "\n", encoding="utf-8")
-    chart.write_text(chart_as_html(recorder.rows, nodeid, note), encoding="utf-8")
+    page = chart_as_html(leading(recorder, failure), recorder.rows, nodeid, note)
+    chart.write_text(page, encoding="utf-8")
     return [
         f"all of it as a chart: {chart}",
         f"repeat it: {before_command()}pytest --holdfast-replay {schedule} '{nodeid}'",
@@ -796,15 +826,18 @@ _ASYNCIO = os.path.join(os.path.dirname(asyncio.__file__), "")
 
 def _difference(first: Simulation, again: Simulation) -> NotRepeatable | None:
     """Where two runs by the same choices went different ways; None: nowhere."""
+    escaped = tuple(dict.fromkeys([*first.escaped, *again.escaped]))
+    parts = parting(first.handled, again.handled)
+    if parts is not None and parts[0].is_same_kind(parts[1]):
+        where, one, other = parts[0].differs(parts[1])
+        return NotRepeatable(first.seed, parts[0].turn, one, other, escaped, f"{where} of {parts[0]}")
     ended = ("", "the end of the run")
-    longest = max(len(first.trace), len(again.trace))
-    for number in range(longest):
-        one = first.trace[number] if number < len(first.trace) else ended
-        other = again.trace[number] if number < len(again.trace) else ended
-        if one != other:
-            escaped = tuple(dict.fromkeys([*first.escaped, *again.escaped]))
-            return NotRepeatable(first.seed, number + 1, " ".join(one).strip(), " ".join(other).strip(), escaped)
-    return None
+    for number in range(max(len(first.trace), len(again.trace))):
+        turn = first.trace[number] if number < len(first.trace) else ended
+        then = again.trace[number] if number < len(again.trace) else ended
+        if turn != then:
+            return NotRepeatable(first.seed, number + 1, " ".join(turn).strip(), " ".join(then).strip(), escaped)
+    return None if parts is None else NotRepeatable(first.seed, parts[0].turn, str(parts[0]), str(parts[1]), escaped)
 
 
 def _in_hypothesis() -> bool:
@@ -829,8 +862,9 @@ def run_schedule(
     recorder: Recorder | None = None,
     *,
     looks: bool = True,
-    latency: Seconds = (0.0, 0.0),
-    sync: Seconds = (0.0, 0.0),
+    notes: bool = False,
+    latency: Said = 0.0,
+    sync: Latency = 0.0,
     ticks: int = TICKS,
 ) -> Simulation:
     """One run under one schedule. Returns what happened.
@@ -839,6 +873,7 @@ def run_schedule(
         recorder: draws up what happens.
         latency, sync, ticks: as `simulate` says.
         looks: whether each message is looked at, as `GuardedSystem` does: that takes most of the time of a run.
+        notes: whether the values of messages and replies are noted, to be compared with those of another run.
 
     Raises:
         whatever the test raises; `error.__simulation__` is the run.
@@ -849,7 +884,7 @@ def run_schedule(
             loop = runner.get_loop()
             assert isinstance(loop, ControlledLoop)
             with TimeLimit(loop):
-                runner.run(_run(test, simulation, own, options, recorder, looks))
+                runner.run(_run(test, simulation, own, options, recorder, looks, notes))
     except BaseException as error:
         error.__simulation__ = simulation  # type: ignore[attr-defined]
         raise
@@ -868,7 +903,7 @@ def run_real(test: Test, own: set[str], options: dict[str, Any], seeds: range | 
         simulation = RealRun(Choices(seed))
         try:
             with asyncio.Runner() as runner:
-                runner.run(_run(test, simulation, own, options, None, looks=True))
+                runner.run(_run(test, simulation, own, options, None, looks=True, notes=False))
         except Exception as error:
             error.add_note(
                 f"seed={seed}, on a real loop (--holdfast-real): its faults are the seed's, and nothing else"
@@ -877,7 +912,13 @@ def run_real(test: Test, own: set[str], options: dict[str, Any], seeds: range | 
 
 
 async def _run(
-    test: Any, simulation: Simulation, own: set[str], options: dict[str, Any], recorder: Recorder | None, looks: bool
+    test: Any,
+    simulation: Simulation,
+    own: set[str],
+    options: dict[str, Any],
+    recorder: Recorder | None,
+    looks: bool,
+    notes: bool,
 ) -> None:
     wanted, faults = running.get(), simulation.faults
     leaks, unseen = LoopLeaks(wanted.leaks), list[str]()
@@ -885,7 +926,7 @@ async def _run(
     simulation.enter(asyncio.get_running_loop(), names_of(test))
     try:
         try:
-            system = await simulation.begin(options, recorder, looks=looks)
+            system = await simulation.begin(options, recorder, looks=looks, notes=notes)
             wanted.tell(system)
             try:
                 given = {"system": system, "faults": faults, "simulation": simulation}

@@ -27,15 +27,17 @@ from ...actors.kernel.message import Message
 from ...actors.kernel.ref import DEFAULT_TIMEOUT, ActorRef
 from ...supervision.spec import ChildSpec
 from ..barrier import idle
+from ..charts.causes import leading
+from ..charts.chart_text import as_text as chart_as_text
+from ..charts.recorder import Recorder
 from ..clock import advance
 from ..faults import Faults, Strikes
 from ..guard.loop_leaks import LoopLeaks
 from ..guarded import GuardedSystem, UnexpectedEnd
 from ..histories.checker import linearizable
 from ..histories.history import History, Model
+from ..latencies import Said
 from ..schedules.bound_names import names_of
-from ..schedules.charts import Recorder
-from ..schedules.charts import as_text as chart_as_text
 from ..schedules.choices import ROUNDS, Choices, Production, as_text, from_text, repeated, require_fit
 from ..schedules.control import ControlledLoop
 from ..schedules.processes import SimulatedWorker
@@ -67,7 +69,7 @@ class ActorMachine(RuleBasedStateMachine):
     Attributes:
         model: what the history has to obey; None: it is not judged.
         options: for ActorSystem. By default its root allows 100 restarts within its period.
-        latency: of processes, as `simulate` takes it.
+        latency: as `simulate` takes it.
         system: the running system; `system.expect_crashes()` and the like say what is meant to happen.
         history: of all that was asked and told through the machine.
         faults: what `inject` injects.
@@ -75,7 +77,7 @@ class ActorMachine(RuleBasedStateMachine):
 
     model: ClassVar[Model[Any] | None] = None
     options: ClassVar[Mapping[str, Any]] = {}
-    latency: ClassVar[float | tuple[float, float]] = 0.0
+    latency: ClassVar[Said] = 0.0
 
     system: GuardedSystem
     history: History
@@ -85,10 +87,9 @@ class ActorMachine(RuleBasedStateMachine):
         super().__init__()
         self._is_drawn, self._schedule = schedule is None and currently_in_test_context(), schedule
         choices = self._choices_of(schedule)
-        late = self.latency if isinstance(self.latency, tuple) else (self.latency, self.latency)
         self.history = History()
         self._options: dict[str, Any] = {"seed": choices.seed, **OPTIONS, **running.get().options, **self.options}
-        self._simulation = Simulation(choices, late)
+        self._simulation = Simulation(choices, type(self).latency)
         self.faults = self._simulation.faults
         self._choices = choices
         self._recorder = Recorder() if self._is_drawn and current_build_context().is_final else None
@@ -284,7 +285,7 @@ class ActorMachine(RuleBasedStateMachine):
         finally:
             problems = self._end()
             if has_failed:
-                self._note()
+                self._note(sys.exc_info()[1] or failure)
         try:
             if problems and not has_failed:
                 raise UnexpectedEnd(tuple(problems))
@@ -292,8 +293,8 @@ class ActorMachine(RuleBasedStateMachine):
                 linearizable(self.history, self.model).verify()
             if self._schedule is not None and not has_failed:
                 require_fit(self._schedule, self._choices)
-        except BaseException:
-            self._note()
+        except BaseException as error:
+            self._note(error)
             raise
 
     async def _outcomes(self) -> None:
@@ -329,12 +330,12 @@ class ActorMachine(RuleBasedStateMachine):
         finally:
             self._leaks.close()
 
-    def _note(self) -> None:
+    def _note(self, failure: BaseException | None) -> None:
         """Print how the example went, if it is the one that Hypothesis shows."""
-        if self._recorder is None:
+        if self._recorder is None or failure is None:
             return
         text = as_text(self._choices.seed, self._choices.kept())
         note(f'repeat it outside of Hypothesis with {type(self).__name__}(schedule="{text}")')
-        chart = chart_as_text(self._recorder.rows)
+        chart = chart_as_text(leading(self._recorder, failure), self._recorder.rows)
         if chart:
             note(chart)

@@ -38,17 +38,25 @@ LEVELS: Final = 64
 
 
 class NotRepeatable(HoldfastError, AssertionError):
-    """The same choices gave another run: something decides that no seed has in its hand."""
+    """The same choices gave another run: something decides that no seed has in its hand.
+
+    Attributes:
+        turn: the number of the turn at which they part.
+        first, again: what that was in each.
+        field: of which message or reply a field has another value, if that is what differs.
+    """
 
     seed: int
     turn: int
     first: str
     again: str
     escaped: tuple[str, ...]
+    field: str = ""
 
     def __str__(self) -> str:
+        where = f"in turn {self.turn} {self.field} was" if self.field else f"turn {self.turn} was"
         text = (
-            f"the run of seed {self.seed} cannot be repeated: turn {self.turn} was {self.first}, and the same choices "
+            f"the run of seed {self.seed} cannot be repeated: {where} {self.first}, and the same choices "
             f"then gave {self.again}. Something decides that is not the seed's"
         )
         if self.escaped:

@@ -24,7 +24,9 @@ from ...actors.kernel import loop as run_loop
 from ...actors.kernel.cell import Cell
 from ...actors.kernel.node import Node
 from ..clock import TICKS, VirtualClockLoop
+from ..latencies import Latencies, LateReplies, What
 from ..swaps import Swaps
+from .choices import Choices
 from .disk import simulated
 from .due import DueQueue, Option, TellingHandle
 from .footprints import Footprints
@@ -35,7 +37,7 @@ from .strategies import Explored
 from .world import EPOCH
 
 if TYPE_CHECKING:
-    from .choices import Choices, Keys
+    from .choices import Keys
     from .turn_log import TurnLog
 
 T = TypeVar("T")
@@ -91,7 +93,8 @@ class ControlledLoop(VirtualClockLoop):
         self._work: dict[asyncio.Future[Any], int] = {}  # of anyio's threads, by when it was given
         self._resting: list[asyncio.Future[None]] = []
         self._dead: list[Any] = []  # tasks: kept, since what is collected is closed, which runs its code
-        self.sync_seconds: Callable[[], float] = float  # that a sync of a simulated store takes: none
+        self.latencies = Latencies(Choices(0), {})  # none
+        self.late_replies: LateReplies | None = None
 
     async def rest(self) -> None:
         """Wait until nothing else can happen at this moment: one tick more is not enough where others come first."""
@@ -203,8 +206,21 @@ class ControlledLoop(VirtualClockLoop):
         if work is None:
             return super().run_in_executor(executor, func, *args)
         done: asyncio.Future[T] = self.create_future()
-        self.call_later(self.sync_seconds(), _do, done, work)
+        self.call_later(self.latencies.of(work.takes)(), _do, done, work)
         return done
+
+    def hold_up(self, what: What) -> None:
+        """Something is done in the loop that takes time, in which nothing else is done here."""
+        seconds = self.latencies.of(what)()
+        if seconds:
+            self.pass_time(seconds)
+
+    def lateness(self) -> float:
+        return self.latencies.of("timers")() if self.control is not None else 0.0
+
+    def on_their_way(self) -> list[float]:
+        """When each late reply arrives."""
+        return [] if self.late_replies is None else self.late_replies.times()
 
     def add(self, place: SimulatedPlace) -> None:
         """A place begins to run in this loop."""

@@ -35,9 +35,8 @@ from ...actors.process.wire.connection import HIGH_BYTES, Connection
 from ...actors.process.worker_pool import Worker, Workers
 from ...checkpoint.life.recorded_context import RecordedContext
 from ...system.worker_main import WorkerComposition
+from ..latencies import DelayLine
 from ..swaps import Swaps
-from .choices import Choices
-from .disk import Latency
 from .places import SimulatedPlace, inside
 
 if TYPE_CHECKING:
@@ -63,7 +62,7 @@ class Pipe(asyncio.Transport):
         self.other: Pipe
         self.protocol: asyncio.BufferedProtocol
         self._pool = pool
-        self._on_its_way: deque[tuple[float, Callable[[], None]]] = deque()
+        self._line = DelayLine(pool.loop, pool.loop.latencies.of("frames"))
         self._arrived: deque[bytes] = deque()  # and our protocol has not read it
         self._unread = 0  # bytes that the other end has not read
         self._is_reading, self._is_closing, self._is_full = True, False, False
@@ -83,7 +82,7 @@ class Pipe(asyncio.Transport):
         if self._unread > HIGH_BYTES and not self._is_full:
             self._is_full = True
             self.protocol.pause_writing()
-        self._send(functools.partial(self.other.arrived, copy))
+        self._line.send(functools.partial(self.other.arrived, copy), self.other.context)
 
     def writelines(self, list_of_data: Any) -> None:
         self.write(b"".join(list_of_data))
@@ -110,35 +109,15 @@ class Pipe(asyncio.Transport):
 
     # -- on the way -------------------------------------------------------------------------------------------------
 
-    def _send(self, go: Callable[[], None]) -> None:
-        self._on_its_way.append((self._pool.loop.time() + self._pool.latency(), go))
-        if len(self._on_its_way) == 1:
-            self._move()
-
     def times(self) -> list[float]:
         """When each thing that was written here arrives."""
-        return [when for when, _ in self._on_its_way]
-
-    def _move(self) -> None:
-        """Have the first thing that is on its way arrive: the next one never comes before it."""
-        loop, when = self._pool.loop, self._on_its_way[0][0]
-        if when <= loop.time():
-            loop.call_soon(self._arrive, context=self.other.context)
-        else:
-            loop.call_at(when, self._arrive, context=self.other.context)
-
-    def _arrive(self) -> None:
-        _, go = self._on_its_way[0]
-        go()
-        self._on_its_way.popleft()
-        if self._on_its_way:
-            self._move()
+        return self._line.times()
 
     def end(self) -> None:
         """Nothing more is written here: the other end sees that behind what was written."""
         if not self._is_closing:
             self._is_closing = True
-            self._send(self.other.ended)
+            self._line.send(self.other.ended, self.other.context)
 
     def arrived(self, data: bytes) -> None:
         """The other end has written this."""
@@ -317,7 +296,6 @@ class SimulatedWorkers(Workers):
 
     def __init__(self, node: Node, loop: ControlledLoop) -> None:
         super().__init__(node, "", [], on_frame, warm=0)
-        self.latency: Callable[[], float] = float  # none
         self.loop = loop
         self.root_context = copy_context()
         self._pids = itertools.count(FIRST_PID)
@@ -327,18 +305,17 @@ class SimulatedWorkers(Workers):
         self._swaps.put(worker_node, "_apply", _no_limits)
         self.effects = EffectProcesses(node.codec, SimulatedEffectProcess)
 
-    def draw_from(self, choices: Choices, seconds: tuple[float, float]) -> None:
-        """From now on what is written takes so many seconds, drawn, until it arrives."""
-        self.latency = Latency(choices, "latencies", seconds)
-
     async def arrived(self) -> bool:
         """Let time pass until what is on its way now has arrived. Returns whether anything was."""
-        times = [when for process in self._processes for when in process.on_its_way()]
+        times = [when for process in self._processes for when in process.on_its_way()] + self.loop.on_their_way()
         if times:
             await asyncio.sleep(max(0.0, max(times) - self.loop.time()))
         return bool(times)
 
     async def _fork(self) -> Worker:
+        seconds = self.loop.latencies.of("starts")()
+        if seconds:
+            await asyncio.sleep(seconds)
         process = SimulatedProcess(next(self._pids), self)
         worker = SimulatedWorker(self, cast("Any", process), cast("Any", self._stub))
         self._alive[process.pid] = worker

@@ -13,6 +13,8 @@ PLUGIN = "tests/testing/test_plugin.py"
 LOOPS = "tests/testing/test_loop_methods.py"
 REPLAYS = "tests/testing/schedules/test_replays.py"
 SCHEDULES = "tests/testing/schedules/test_schedules.py"
+LATENCIES = "tests/testing/schedules/test_latencies.py"
+CHARTS = "tests/testing/charts/test_charts.py"
 ESCAPES = "tests/testing/schedules/test_escapes.py"
 
 CHECKS = {
@@ -260,6 +262,139 @@ CHECKS = {
         "            found = self._hash = hash(self._cell.path)\n",
         SCHEDULES,
         "test_a_set_of_refs",
+    ),
+    "a latency is drawn by the seed, and kept as a choice": Check(
+        "testing/latencies.py",
+        "        return row[self._choices.draw(DELAY, len(row), int(self._draw() * len(row)))]\n",
+        "        return row[int(self._draw() * len(row))]\n",
+        LATENCIES,
+        "test_a_late_frame_is_found_repeated",
+    ),
+    "what is no latency is refused": Check(
+        "testing/latencies.py",
+        "    if wrong or not row:\n",
+        "    if not row:\n",
+        LATENCIES,
+        "test_what_is_no_latency_is_refused",
+    ),
+    "what comes late comes in order": Check(
+        "testing/latencies.py",
+        "        if len(self._waiting) == 1:\n            self._move()\n",
+        "        self._loop.call_later(self.seconds(), self._waiting.pop()[1])\n",
+        LATENCIES,
+        "test_replies_of_one_actor_keep_their_order",
+    ),
+    "the store holds up the loop": Check(
+        "testing/schedules/control.py",
+        "            self.pass_time(seconds)\n",
+        "            pass\n",
+        LATENCIES,
+        "test_each_takes_what_was_said and writes",
+    ),
+    "a timer that is due right now is called": Check(
+        "testing/clock.py",
+        "        self._clock_resolution = math.ulp(self._virtual.now)  # Else",
+        "        pass  # Else",
+        LATENCIES,
+        "test_each_takes_what_was_said and reads",
+    ),
+    "timers are late": Check(
+        "testing/clock.py",
+        "                self._loop.pass_time(late)\n",
+        "                pass\n",
+        LATENCIES,
+        "test_a_timer_is_late",
+    ),
+    "choices become smaller": Check(
+        "testing/schedules/shrinking.py",
+        "    shrinking.make_smaller()\n",
+        "",
+        LATENCIES,
+        "test_a_late_frame_is_found_repeated",
+    ),
+    "of equally few choices those with the fewest turns are left": Check(
+        "testing/schedules/shrinking.py",
+        "        return len(self.items), self.turns, self.actors, drawn,",
+        "        return len(self.items), drawn, drawn, drawn,",
+        SCHEDULES,
+        "test_of_equally_few_choices",
+    ),
+    "the values of messages are compared": Check(
+        "testing/schedules/turn_log.py",
+        "                self.values.turn(cell, item, name)\n",
+        "                pass\n",
+        SCHEDULES,
+        "test_values_that_do_not_repeat and message",
+    ),
+    "the values of replies are compared": Check(
+        "testing/simulation.py",
+        '            self._swaps.put(Ask, "answer", values.answering(Ask.answer))\n',
+        "",
+        SCHEDULES,
+        "test_values_that_do_not_repeat and reply",
+    ),
+    "what a store has fed is compared": Check(
+        "testing/schedules/turn_log.py",
+        "            value = Parcel(item.feed.name, bytes(item.feed.body))\n",
+        "            value = None\n",
+        SCHEDULES,
+        "test_values_that_do_not_repeat and recorded",
+    ),
+    "every run is made twice at night": Check(
+        "testing/simulation.py",
+        'TWICE = {"ci": 10, "nightly": 1}\n',
+        'TWICE = {"ci": 10, "nightly": 10}\n',
+        REPLAYS,
+        "test_a_profile_has_its_number_of_seeds and nightly",
+    ),
+    "the chart shows what leads to the failure": Check(
+        "testing/charts/causes.py",
+        "    found = _behind(recorder, rows) if rows else",
+        "    found =",
+        CHARTS,
+        "test_bystanders_are_left_out",
+    ),
+    "a turn follows from the one that has sent": Check(
+        "testing/charts/recorder.py",
+        "            row.causes.append(Cause(self._moment, sent.row, sent.moment))\n",
+        "            pass\n",
+        CHARTS,
+        "test_what_leads_to_a_failure_is_found and probe",
+    ),
+    "a turn follows from replies": Check(
+        "testing/charts/recorder.py",
+        "                for row in {number, self._row_here()} - {-1}:\n",
+        "                for row in ():\n",
+        CHARTS,
+        "test_what_leads_to_a_failure_is_found and later",
+    ),
+    "a turn follows from orders": Check(
+        "testing/charts/causes.py",
+        "    rows += [order.row for path in shown for order in recorder.orders.get(path, ())]\n",
+        "",
+        CHARTS,
+        "test_what_leads_to_a_failure_is_found and stopped",
+    ),
+    "a turn that is not over is followed to the end": Check(
+        "testing/charts/causes.py",
+        " or (waiting := [(row, NEVER) for row in hanging if until.get(row, NEVER) < NEVER])",
+        "",
+        CHARTS,
+        "test_what_leads_to_a_failure_is_found and wait",
+    ),
+    "what a store has fed is decoded": Check(
+        "testing/charts/recorder.py",
+        "        packed = Parcel(item.feed.name, bytes(item.feed.body))\n",
+        "        packed = None\n",
+        CHARTS,
+        "test_turns_of_the_library_are_left_out and recorded_actors",
+    ),
+    "turns of the library are hidden": Check(
+        "testing/charts/causes.py",
+        "if number in found and not row.is_library]",
+        "if number in found]",
+        CHARTS,
+        "test_turns_of_the_library_are_left_out and recorded_actors",
     ),
 }
 

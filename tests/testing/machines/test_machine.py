@@ -244,7 +244,7 @@ def test_a_planted_bug_is_found_and_its_example_can_be_repeated(
     schedule = re.search(r'schedule="([^"]*)"', notes)
     assert schedule is not None
     assert len(lines) <= 8
-    assert "turns:" in notes
+    assert re.search(r"^the \d+ turns ", notes, re.M)
     with pytest.raises(errors) as again:
         repeat(machine, schedule[1], notes)
     assert type(again.value) is type(caught.value)

@@ -198,8 +198,18 @@ def test_what_has_failed_is_tried_first_until_it_passes(pytester: pytest.Pyteste
 
 
 @pytest.mark.parametrize(
-    ("args", "count"), [((), 5), (("--holdfast-profile", "ci"), 5), (("--holdfast-profile", "nightly"), 125)]
+    ("args", "count", "twice"),
+    [
+        ((), 5, 10),
+        (("--holdfast-profile", "ci"), 5, 10),
+        (("--holdfast-profile", "nightly"), 125, 1),
+        (("--holdfast-twice", "2"), 5, 2),
+        (("--holdfast-profile", "nightly", "--holdfast-seeds", "5", "--holdfast-twice", "3"), 5, 3),
+    ],
 )
-def test_a_profile_has_its_number_of_seeds(pytester: pytest.Pytester, args: tuple[str, ...], count: int) -> None:
+def test_a_profile_has_its_number_of_seeds_and_of_runs_made_twice(
+    pytester: pytest.Pytester, args: tuple[str, ...], count: int, twice: int
+) -> None:
     run_suite(pytester, HEAD + TELLS_ITS_SEEDS.replace("!= 3", ">= 0"), "--collect-only")
-    assert {*seeds_run(pytester, *args)} == {*range(count)}
+    expected = [seed for seed in range(count) for _ in range(1 + (seed % twice == 0))]
+    assert seeds_run(pytester, *args) == expected
