@@ -20,7 +20,7 @@ from typing import Final, Literal, Protocol, get_args
 
 from ...actors.errors import SpecError
 from .choices import TURN, Choices, Keys, Production, Replay, Taken, Walk
-from .footprints import ALL, Footprint, Footprints
+from .reduction.search import Exhaustive
 
 Name = Literal["mixed", "random", "pct", "exhaustive", "coverage"]
 NAMES: Final = get_args(Name)
@@ -202,98 +202,3 @@ class Changed(Replay):
 
     def redrawn(self, kind: str, number: int, count: int, proposed: int) -> int:
         return proposed if self._draw.random() < 0.5 else super().redrawn(kind, number, count, proposed)
-
-
-class ChoicePoint:
-    """One choice of the search tree, with what has been explored below it."""
-
-    def __init__(self, options: tuple[Hashable, ...], asleep: dict[Hashable, Footprint]) -> None:
-        self.options = options
-        self.asleep = asleep  # whose order against the step that led here does not matter, with what they touch
-        self.taken = next((index for index, key in enumerate(options) if key not in asleep), 0)
-        self.footprint = ALL  # of the step taken
-
-    @property
-    def is_redundant(self) -> bool:
-        """Whether every schedule from here has an equal one that was tried."""
-        return all(key in self.asleep for key in self.options)
-
-    def advance(self) -> bool:
-        """Go on to the next option; False: there is none."""
-        self.asleep[self.options[self.taken]] = self.footprint
-        left = [index for index, key in enumerate(self.options) if key not in self.asleep]
-        if not left:
-            return False
-        self.taken = left[0]
-        return True
-
-
-class Exhaustive:
-    """Depth first through all schedules, with sleep sets."""
-
-    def __init__(self) -> None:
-        self.path: list[ChoicePoint] = []
-        self._is_over = False
-
-    def choices(self, seed: int) -> Choices | None:
-        return None if self._is_over else Explored(seed, self.path)
-
-    def learn(self, choices: Choices, trace: Trace) -> None:
-        assert isinstance(choices, Explored)
-        choices.close()
-        while self.path and not self.path[-1].advance():
-            self.path.pop()
-        self._is_over = not self.path
-
-
-class Explored(Choices):
-    """One path of the search: repeated as far as it is known, then the first that does not sleep."""
-
-    def __init__(self, seed: int, path: list[ChoicePoint]) -> None:
-        super().__init__(seed)
-        self.footprints: Footprints | None = None  # tells what a step has touched
-        self._path = path
-        self._names: dict[Hashable, Hashable] = {}
-        self._is_redundant = False
-
-    def _name(self, key: Hashable) -> Hashable:
-        """The same for the same actor, task or timer in each run: paths, or the order in which they came."""
-        return self._names.setdefault(key, getattr(key, "path", None) or len(self._names))
-
-    def choose(self, count: int, keys: Keys) -> int:
-        assert self.footprints is not None
-        number = self.steps - 1
-        options = tuple(map(self._name, keys()))
-        if self._is_redundant:
-            return 0
-        if number < len(self._path):
-            if number:
-                self._path[number - 1].footprint = self.footprints.footprint()
-            point = self._path[number]
-            self.footprints.begin()
-            return min(point.taken, count - 1)
-        self.close()
-        last = self._path[-1] if self._path else None
-        slept = {} if last is None or last.footprint is ALL else last.asleep
-        step = ALL if last is None else last.footprint
-        asleep = {
-            key: touched
-            for key, touched in slept.items()
-            if key in options and touched is not ALL and not step & touched
-        }
-        point = ChoicePoint(options, asleep)
-        if point.is_redundant:
-            self._is_redundant = True
-            return 0
-        self._path.append(point)
-        self.footprints.begin()
-        return point.taken
-
-    def end(self) -> None:
-        self.close()
-        self._is_redundant = True
-
-    def close(self) -> None:
-        """Note what the last step has touched, with all that came without a choice after it."""
-        if self._path and not self._is_redundant and self.footprints is not None and self.steps >= len(self._path):
-            self._path[-1].footprint = self.footprints.footprint()
