@@ -20,6 +20,7 @@ from collections.abc import Callable, Hashable, Iterable
 from contextvars import Context
 from typing import TYPE_CHECKING, Any, Final, TypeVar, TypeVarTuple
 
+from ...actors.kernel import lifecycle
 from ...actors.kernel import loop as run_loop
 from ...actors.kernel.cell import Cell
 from ...actors.kernel.node import Node
@@ -30,7 +31,7 @@ from .due import DueQueue, Option, TellingHandle
 from .livelock import Rounds
 from .numbered import NumberedFuture, NumberedTask
 from .places import SimulatedPlace, inside, is_dead, never, no_more
-from .reduction.search import Explored
+from .reduction.stepped import Stepped
 from .reduction.telling import TellingFuture, TellingTask
 from .reduction.watch import Watch
 from .world import EPOCH
@@ -337,10 +338,12 @@ class Control:
         self._nodes: dict[object, DrawnCells] = {}
         self._drained: DrawnCells | None = None  # where a turn was begun, after which nothing has been chosen yet
         self.watch: Watch | None = None
-        if isinstance(choices, Explored):
+        if isinstance(choices, Stepped):
             self.watch = loop.due.watch = choices.watch = Watch(choices, node)
             self._due.is_told = True
         self._swaps = Swaps()
+        if self.watch is not None:
+            self._swaps.put(lifecycle, "build", self.watch.build)
         self._swaps.put(run_loop, "clock", self._clock)
         for name in ("MOST", "STRIDE"):
             self._swaps.put(run_loop, name, 1)

@@ -4,12 +4,12 @@
 - `random`: whoever could run is as likely as any other.
 - `pct`: random priorities and `depth - 1` moments at which one falls. Among n tasks and k choices it finds a bug that
   needs `depth` events in one order with a probability of at least 1 / (n k^(depth - 1)) in each run.
-- `exhaustive`: every schedule, except those that differ only in the order of turns that have nothing to do with each
-  other. For small systems whose actors share nothing but messages.
+- `exhaustive`: every schedule, except those that differ only in the order of steps that have nothing to do with each
+  other; or, with `holds`, every schedule in which at most so many times somebody is held up.
 - `coverage`: random changes to schedules that brought a new order of messages.
 
-Source: PCT: Burckhardt et al., ASPLOS 2010; sleep sets: Godefroid, LNCS 1032 (1996), chapter 5; mixing strategies and
-feedback: Coyote (Deligiannis et al., TACAS 2023) and AFL.
+Source: PCT: Burckhardt et al., ASPLOS 2010; mixing strategies and feedback: Coyote (Deligiannis et al., TACAS 2023)
+and AFL; see `reduction` for the exhaustive searches.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from typing import Final, Literal, Protocol, get_args
 
 from ...actors.errors import SpecError
 from .choices import TURN, Choices, Keys, Production, Replay, Taken, Walk
+from .reduction.bounded import Bounded
 from .reduction.search import Exhaustive
 
 Name = Literal["mixed", "random", "pct", "exhaustive", "coverage"]
@@ -51,8 +52,19 @@ class Strategy(Protocol):
         """The run is over."""
         ...
 
+    def covered(self, runs: int) -> str:
+        """What so many runs have covered, in words; "": nothing that could be said."""
+        ...
 
-class EachSeed:
+
+class Drawing:
+    """Never comes to an end."""
+
+    def covered(self, runs: int) -> str:
+        return ""
+
+
+class EachSeed(Drawing):
     """A schedule per seed, whatever the runs before were like."""
 
     def __init__(self, made: Callable[[int], Choices]) -> None:
@@ -65,14 +77,16 @@ class EachSeed:
         """Nothing."""
 
 
-def strategy(name: str, depth: int = DEPTH) -> Strategy:
+def strategy(name: str, depth: int = DEPTH, holds: int | None = None) -> Strategy:
     """The strategy of that name.
 
     Raises:
-        SpecError: there is none, or `depth` is not 1 or more.
+        SpecError: there is none, `depth` is not 1 or more, or `holds` is not 0 or more, or for another strategy.
     """
     if depth < 1:
         raise SpecError("simulate", f"depth must be 1 or more, not {depth!r}")
+    if holds is not None and (name != "exhaustive" or type(holds) is not int or holds < 0):
+        raise SpecError("simulate", f"holds must be 0 or more, and is for strategy='exhaustive' alone, not {holds!r}")
     match name:
         case "mixed":
             return EachSeed(mixed)
@@ -81,7 +95,7 @@ def strategy(name: str, depth: int = DEPTH) -> Strategy:
         case "pct":
             return Pct(depth)
         case "exhaustive":
-            return Exhaustive()
+            return Exhaustive() if holds is None else Bounded(holds)
         case "coverage":
             return CoverageGuided()
         case _:
@@ -133,7 +147,7 @@ class Priorities(Choices):
         return best
 
 
-class Pct:
+class Pct(Drawing):
     """PCT of one depth. The first run measures how many choices there are."""
 
     def __init__(self, depth: int) -> None:
@@ -146,7 +160,7 @@ class Pct:
         self._length = max(self._length, choices.steps, 1)
 
 
-class CoverageGuided:
+class CoverageGuided(Drawing):
     """Changes at random what has brought something new: two messages next to each other at an actor in a new order.
 
     Who came when is something new, too, but hardly a run is without: what has brought only that is taken less often.

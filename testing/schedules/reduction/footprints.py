@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable
+from collections.abc import Hashable, Iterator
 from typing import Final, NamedTuple
 
 Token = Hashable
@@ -11,11 +11,9 @@ Token = Hashable
 EVERYTHING: Final = "everything"
 """Read by each step that does anything, and changed by those whose effects are not known."""
 PROGRAM: Final = "the program"
-"""The memory of the test and its tasks."""
+"""The memory of the test and its tasks, and of actors that share some with it or with each other."""
 LIBRARY: Final = "the library"
 """The memory of the library's own tasks: stores, journals, processes."""
-LOOKS: Final = "what the test may look at"
-"""Changed by the code of a test, read by each turn: a test may read what an actor has without asking it."""
 
 
 class Footprint(NamedTuple):
@@ -74,7 +72,7 @@ class _Accesses:
         self.readers: list[int] = []
 
 
-def races(steps: list[Step], begin: int = 0) -> Iterable[Race]:
+def races(steps: list[Step], begin: int = 0) -> Iterator[Race]:
     """All pairs of steps that meet, with nothing between them that orders them; the second one from `begin` on.
 
     Source: source sets: Abdulla, Aronis, Jonsson, Sagonas, POPL 2014.
@@ -88,10 +86,9 @@ def races(steps: list[Step], begin: int = 0) -> Iterable[Race]:
     latest: dict[Hashable, int] = {}
     for number, step in enumerate(steps):
         ordered = (1 << step.since) - 1
-        for earlier in step.enabled_by:
+        own = latest.get(step.owner)
+        for earlier in (*step.enabled_by, *(() if own is None else (own,))):
             ordered |= before[earlier] | 1 << earlier
-        if (own := latest.get(step.owner)) is not None:
-            ordered |= before[own] | 1 << own
         latest[step.owner] = number
         for earlier in sorted(_met(step.footprint, accesses), reverse=True):
             if not ordered >> earlier & 1:

@@ -15,9 +15,33 @@ from collections.abc import Iterator
 from typing import Any, Final
 
 HARMLESS: Final = frozenset(
-    "CACHE RESUME NOP POP_TOP PUSH_NULL COPY SWAP LOAD_CONST LOAD_SMALL_INT FOR_ITER END_FOR SEND END_SEND YIELD_VALUE "
-    "GET_AWAITABLE PRECALL EXTENDED_ARG COMPARE_OP BINARY_OP IS_OP UNARY_NOT UNARY_NEGATIVE TO_BOOL NOT_TAKEN "
-    "POP_ITER".split()
+    [
+        "CACHE",
+        "RESUME",
+        "NOP",
+        "POP_TOP",
+        "PUSH_NULL",
+        "COPY",
+        "SWAP",
+        "LOAD_CONST",
+        "LOAD_SMALL_INT",
+        "FOR_ITER",
+        "END_FOR",
+        "SEND",
+        "END_SEND",
+        "YIELD_VALUE",
+        "GET_AWAITABLE",
+        "PRECALL",
+        "EXTENDED_ARG",
+        "COMPARE_OP",
+        "BINARY_OP",
+        "IS_OP",
+        "UNARY_NOT",
+        "UNARY_NEGATIVE",
+        "TO_BOOL",
+        "NOT_TAKEN",
+        "POP_ITER",
+    ]
 )
 JUMPS: Final = frozenset((*dis.hasjrel, *dis.hasjabs))
 PLAIN: Final = (int, float, str, bytes, type(None))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Hashable
 from contextvars import Context, copy_context
-from typing import Any, Protocol, TypeVar
+from typing import Any, ClassVar, Protocol, TypeVar
 
 from ..numbered import NumberedFuture, NumberedTask
 
@@ -23,16 +23,58 @@ class Listener(Protocol):
         ...
 
 
-class TellingFuture(NumberedFuture[T]):
+class Telling:
+    """What a future and a task have in common: each look at one is told, and each end that comes from outside."""
+
+    __slots__ = ()
+
+    kind: ClassVar[str]
+    listener: Listener
+    number: int
+
+    @property
+    def token(self) -> Hashable:
+        return self.kind, self.number
+
+    def cancel(self, msg: Any = None) -> bool:
+        self.listener.write(self.token)
+        return self._real.cancel(msg)
+
+    def done(self) -> bool:
+        self.listener.read(self.token)
+        return self._real.done()
+
+    def cancelled(self) -> bool:
+        self.listener.read(self.token)
+        return self._real.cancelled()
+
+    def result(self) -> Any:
+        self.listener.read(self.token)
+        return self._real.result()
+
+    def exception(self) -> BaseException | None:
+        self.listener.read(self.token)
+        return self._real.exception()
+
+    def add_done_callback(self, fn: Callable[[Any], object], /, *, context: Context | None = None) -> None:
+        self.listener.read(self.token)
+        self._real.add_done_callback(fn, context=copy_context() if context is None else context)
+
+    def __await__(self) -> Generator[Any, None, Any]:
+        self.listener.read(self.token)
+        return self._real.__await__()
+
+    @property
+    def _real(self) -> Any:
+        return super()
+
+
+class TellingFuture(Telling, NumberedFuture[T]):
     """A future of a run whose steps have footprints."""
 
     __slots__ = ("listener",)
 
-    listener: Listener
-
-    @property
-    def token(self) -> Hashable:
-        return ("future", self.number)
+    kind = "future"
 
     def set_result(self, result: T) -> None:
         self.listener.write(self.token)
@@ -42,74 +84,16 @@ class TellingFuture(NumberedFuture[T]):
         self.listener.write(self.token)
         super().set_exception(exception)
 
-    def cancel(self, msg: Any = None) -> bool:
-        self.listener.write(self.token)
-        return super().cancel(msg)
-
-    def done(self) -> bool:
-        self.listener.read(self.token)
-        return super().done()
-
-    def cancelled(self) -> bool:
-        self.listener.read(self.token)
-        return super().cancelled()
-
-    def result(self) -> T:
-        self.listener.read(self.token)
-        return super().result()
-
-    def exception(self) -> BaseException | None:
-        self.listener.read(self.token)
-        return super().exception()
-
-    def add_done_callback(self, fn: Callable[[Any], object], /, *, context: Context | None = None) -> None:
-        self.listener.read(self.token)
-        super().add_done_callback(fn, context=copy_context() if context is None else context)
-
-    def __await__(self) -> Generator[Any, None, T]:
-        self.listener.read(self.token)
-        return super().__await__()
-
-    __iter__ = __await__
+    __iter__ = Telling.__await__
 
 
-class TellingTask(NumberedTask[T]):
+class TellingTask(Telling, NumberedTask[T]):
     """A task of such a run."""
 
     __slots__ = ("listener",)
 
+    kind = "task"
+
     def __init__(self, listener: Listener, number: int, *args: Any, **options: Any) -> None:
         self.listener = listener
         super().__init__(number, *args, **options)
-
-    @property
-    def token(self) -> Hashable:
-        return ("task", self.number)
-
-    def cancel(self, msg: Any = None) -> bool:
-        self.listener.write(self.token)
-        return super().cancel(msg)
-
-    def done(self) -> bool:
-        self.listener.read(self.token)
-        return super().done()
-
-    def cancelled(self) -> bool:
-        self.listener.read(self.token)
-        return super().cancelled()
-
-    def result(self) -> T:
-        self.listener.read(self.token)
-        return super().result()
-
-    def exception(self) -> BaseException | None:
-        self.listener.read(self.token)
-        return super().exception()
-
-    def add_done_callback(self, fn: Callable[[Any], object], /, *, context: Context | None = None) -> None:
-        self.listener.read(self.token)
-        super().add_done_callback(fn, context=copy_context() if context is None else context)
-
-    def __await__(self) -> Generator[Any, None, T]:
-        self.listener.read(self.token)
-        return super().__await__()

@@ -5,30 +5,36 @@ from __future__ import annotations
 import asyncio
 import inspect
 import random
+import sys
 import types
 from collections import defaultdict, deque
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+from ....actors.kernel.actor import Start
 from ....actors.kernel.cell import NEXT_URGENT, Cell
-from ....actors.kernel.loop import Runner, RunnerTask
+from ....actors.kernel.context import ActorContext
+from ....actors.kernel.lifecycle import build
+from ....actors.kernel.loop import RunnerTask
 from ....actors.kernel.node import Node
 from ....actors.kernel.ref import current
 from ....actors.kernel.timers import LoopTimer
 from ...library_code import is_file_of_library
 from ..places import LOOP, Root, inside, lane_of
-from .footprints import EVERYTHING, LIBRARY, LOOKS, PROGRAM, Footprint, Step
+from .footprints import EVERYTHING, LIBRARY, PROGRAM, Footprint
 from .pauses import Pause, pause_of
+from .sharing import shares_memory
 from .telling import TellingFuture, TellingTask
 
 if TYPE_CHECKING:
     from ..due import Option
-    from .search import Explored
+    from .stepped import Stepped
 
 ASYNCIO = asyncio.__file__.rpartition("/")[0]
 ORDERS = 0
 """In place of the id of a message: commands come in order."""
+ACTOR: Any = Cell.actor
 GATHERED = "gather.<locals>._done_callback"
 WAKE_UPS = ("_set_result_unless_cancelled", "_release_waiter")
 """Timers of asyncio that end a wait, and do nothing else."""
@@ -38,12 +44,12 @@ class Watch:
     """Tells a search of each step of a run.
 
     Args:
-        explored: is told.
+        stepped: is told.
         node: of the root: what its actors do is known. A step in another place is taken to touch everything.
     """
 
-    def __init__(self, explored: Explored, node: Node) -> None:
-        self._explored, self._node = explored, node
+    def __init__(self, stepped: Stepped, node: Node) -> None:
+        self._stepped, self._node = stepped, node
         self._reads: set[Hashable] = set()
         self._writes: set[Hashable] = set()
         self._is_silent = False
@@ -52,6 +58,9 @@ class Watch:
         self._made: dict[int, int] = {}  # by the id of a callback: in which step it was scheduled
         self._sent: dict[Cell, dict[int, deque[int]]] = defaultdict(lambda: defaultdict(deque))
         self._set: dict[Hashable, int] = {}  # by future: in which step it has got its outcome
+        self._is_program = True  # whether code of the test runs in this step
+        self._sharing: set[Cell] = set()  # actors whose memory is that of the test, too
+        self._held: set[Hashable] = set()  # the actors that the test has got hold of, and may look into
         self._pause: Pause | None = None  # where the task of this step has waited before it
         self._task: asyncio.Task[Any] | None = None
         self._names: dict[int, tuple[object, Hashable]] = {}
@@ -112,7 +121,26 @@ class Watch:
             self._order(cell)
             Cell.request_stop(cell, *args)
 
-        return {"take_in": take_in, "push": push, "urge": urge, "kill": kill, "request_stop": request_stop}
+        def actor(cell: Cell) -> Any:
+            if self._is_program and not is_file_of_library(sys._getframe(1).f_code.co_filename):
+                self._held.add(("actor", cell.path))
+            return ACTOR.__get__(cell)
+
+        looked_at: Any = property(actor, ACTOR.__set__)
+        return {
+            "actor": looked_at,
+            "take_in": take_in,
+            "push": push,
+            "urge": urge,
+            "kill": kill,
+            "request_stop": request_stop,
+        }
+
+    def build(self, cell: Cell, start: Start[Any], context: Callable[[Cell], ActorContext]) -> None:
+        """In place of the function that makes an actor."""
+        if shares_memory(start):
+            self._sharing.add(cell)
+        build(cell, start, context)
 
     def _send(self, cell: Cell, item: Any) -> None:
         self.write(("mailbox", cell.path))
@@ -127,9 +155,8 @@ class Watch:
     def footprint(self) -> Footprint:
         """What the present step has touched so far."""
         reads, writes = set(self._reads), set(self._writes)
-        if self._is_pause():
-            writes.discard(PROGRAM)
-            writes.discard(LOOKS)
+        if self._is_program and not self._is_pause():
+            writes |= {PROGRAM, *self._held}
         state = self._state()
         for cell in state.keys() | self._cells.keys():
             if state.get(cell) != self._cells.get(cell):
@@ -144,9 +171,10 @@ class Watch:
         """An actor has the next step."""
         self._begin(self.name(cell), self._sender(cell))
         self._writes.add(("actor", cell.path))
-        self._reads.add(LOOKS)
+        if cell in self._sharing:
+            self._writes.add(PROGRAM)
         more = cell.more
-        if cell.node is not self._node or more is not None and more.outlet is not None:
+        if cell.node is not self._node or (more is not None and more.outlet is not None):
             self._writes.add(LIBRARY)
         if more is not None and more.bound is not None:
             self._writes.add(("mailbox", cell.path))
@@ -160,7 +188,7 @@ class Watch:
         if has_place:
             lane = lane_of(handle)
             self._lanes[lane].popleft()
-            self._explored.keep_place(lane, made)
+            self._stepped.keep_place(lane, made)
         place = handle._context.get(inside)
         if place is not None and type(place) is not Root:
             self._writes.add(EVERYTHING)
@@ -179,10 +207,10 @@ class Watch:
             if runner._context is None:  # It takes over the wait of the turn, whatever has become of that.
                 waiting = turn.waiting
                 if isinstance(waiting, TellingFuture) and waiting.token in self._set:
-                    self._explored.needs(self._set[waiting.token])
+                    self._stepped.need(self._set[waiting.token])
                 self._is_silent = True
-            else:
-                self._reads.add(LOOKS)
+            elif turn.cell in self._sharing:
+                self._writes.add(PROGRAM)
             return
         if isinstance(task, TellingTask):
             self._writes.add(task.token)
@@ -195,9 +223,8 @@ class Watch:
         if isinstance(owner, LoopTimer):
             self._writes.add(("actor", owner._cell.path))
             return
-        if isinstance(callback, types.FunctionType) and callback.__qualname__ == GATHERED:
-            if _has_succeeded(*handle._args):  # In which order they come is the same to whoever has gathered them.
-                return
+        if _is_gathered(callback) and _has_succeeded(*handle._args):
+            return  # In which order they come is the same to whoever has gathered them.
         code = getattr(inspect.unwrap(getattr(callback, "func", callback)), "__code__", None)
         if type(handle) is asyncio.TimerHandle and getattr(callback, "__name__", "") in WAKE_UPS:
             return
@@ -209,19 +236,18 @@ class Watch:
         own = [file for file in files if not file.startswith((ASYNCIO, "<"))]
         if actor is not None:
             self._writes.add(("actor", actor._cell.path))
-            self._reads.add(LOOKS)
+            if actor._cell in self._sharing:
+                self._writes.add(PROGRAM)
         elif own and all(map(is_file_of_library, own)):
             self._writes.add(LIBRARY)
         else:
-            self._writes.add(PROGRAM)
-            if own:
-                self._writes.add(LOOKS)
+            self._is_program = True
 
     def _begin(self, owner: Hashable, enabled_by: set[int]) -> None:
-        self._explored.begin(owner, self.footprint, enabled_by)
-        self._number = self._explored.number
+        self._stepped.begin(owner, self.footprint, enabled_by)
+        self._number = self._stepped.number
         self._reads, self._writes, self._is_silent = set(), set(), False
-        self._cells, self._task, self._pause = self._state(), None, None
+        self._cells, self._task, self._pause, self._is_program = self._state(), None, None, False
         self._random = random.getstate()
 
     def _is_pause(self) -> bool:
@@ -237,7 +263,7 @@ class Watch:
         if item is NEXT_URGENT:  # Without the order the actor could have had a turn all the same, if it was ready.
             orders = sent[ORDERS]
             step = orders.popleft() if orders else -1
-            return set() if step < 0 or self._explored.was_ready(step, self.name(cell)) else {step}
+            return set() if step < 0 or self._stepped.was_ready(step, self.name(cell)) else {step}
         steps = sent.get(id(item))
         return {step for step in (steps.popleft(),) if step >= 0} if steps else set()
 
@@ -262,7 +288,7 @@ class Watch:
 
     def time_passes(self) -> None:
         """Nothing else could happen at this moment."""
-        self._explored.end_moment()
+        self._stepped.end_moment()
 
     def name(self, key: Hashable) -> Hashable:
         """The same for the same actor, task or timer in each run: paths, or the order in which they came."""
@@ -288,6 +314,10 @@ class Watch:
             found[cell] = (cell.state, cell.life)
             cells += (cell.children or {}).values()
         return found
+
+
+def _is_gathered(callback: Any) -> bool:
+    return isinstance(callback, types.FunctionType) and callback.__qualname__ == GATHERED
 
 
 def _has_succeeded(future: Any) -> bool:
