@@ -146,18 +146,19 @@ def test_three_adders_end_and_come_to_all_three_sums() -> None:
     assert 90 <= found.runs < 250
 
 
-def test_a_loop_that_only_waits_multiplies_nothing() -> None:
-    """Of 16 rounds of `sleep(0)` beside an adder, only that counts which the test does behind them."""
+@pytest.mark.parametrize("name", ["lost_update", "lost_update_of_tasks"])
+def test_a_loop_that_only_waits_multiplies_nothing(name: str) -> None:
+    """Of the rounds of `sleep(0)`, in which anything else may happen, only that counts which is done behind them."""
 
     async def passes(system: GuardedSystem) -> None:
         try:
-            await PLANTED["lost_update"](system)
+            await PLANTED[name](system)
         except AssertionError:
             pass
 
     found = search(passes, seeds=100)
     assert found.is_complete
-    assert found.runs < 30
+    assert found.runs < 40
 
 
 def test_schedules_that_differ_only_in_what_has_nothing_to_do_with_each_other_sleep() -> None:
