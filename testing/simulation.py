@@ -402,6 +402,7 @@ class SimulationSettings:
     replay: str | None = None
     strategy: str = "mixed"
     depth: int = DEPTH
+    holds: int | None = None
     latency: Said = 0.0
     sync: Latency = 0.0
     ticks: int = TICKS
@@ -412,7 +413,7 @@ class SimulationSettings:
             raise ValueError(f"simulate takes one seed or more, not seeds={self.seeds}")
         if self.ticks < 1:
             raise ValueError(f"simulate takes one tick or more, not ticks={self.ticks}")
-        strategy_of(self.strategy, self.depth)
+        strategy_of(self.strategy, self.depth, self.holds)
         said_latencies(self.latency, self.sync)
         if self.replay is not None:
             from_text(parted(self.replay)[0])
@@ -481,6 +482,7 @@ def simulate(
     replay: str | None = None,
     strategy: str = "mixed",
     depth: int = DEPTH,
+    holds: int | None = None,
     latency: Said = 0.0,
     sync: Latency = 0.0,
     ticks: int = TICKS,
@@ -504,6 +506,8 @@ def simulate(
         replay: only this schedule, as a failure has printed it. The option --holdfast-replay FILE says the same.
         strategy: mixed, random, pct, exhaustive, coverage.
         depth: of PCT: how many events have to come in one order for the bug to show.
+        holds: of `exhaustive`: every schedule in which at most so many times somebody is held up until nobody else
+            could run, fewest first; None: every schedule. What it has covered is printed.
         latency: seconds that what an actor's process and the root write to each other takes: a number, (least,
             longest), a distribution of `holdfast.testing.latencies`, or a function that draws them from a
             `random.Random`. `{"starts": ..., "reads": ...}`: each by what takes it: frames, starts, reads, writes,
@@ -518,7 +522,7 @@ def simulate(
         the same choices differ. UnfitSchedule: a run that was to be repeated passes, and is another. SpecError,
         ValueError, TypeError: the arguments are wrong.
     """
-    settings = SimulationSettings(seeds, seed, replay, strategy, depth, latency, sync, ticks, options)
+    settings = SimulationSettings(seeds, seed, replay, strategy, depth, holds, latency, sync, ticks, options)
     return settings.decorate if test is None else settings.decorate(test)
 
 
@@ -532,13 +536,18 @@ class ScheduleSearch:
     Attributes:
         runs: how many schedules have been tried.
         is_complete: whether there is no other schedule.
+        covered: what has been tried, in words, once an exhaustive search has ended.
     """
 
     def __init__(self, test: Test, own: Iterable[str], settings: SimulationSettings) -> None:
         self.runs = 0
         self.is_complete = False
+        self.covered = ""
         self._test, self._own, self._settings = test, set(own), settings
-        self._strategy, self._named = strategy_of(settings.strategy, settings.depth), settings.strategy
+        self._strategy, self._named = (
+            strategy_of(settings.strategy, settings.depth, settings.holds),
+            settings.strategy,
+        )
         self._wanted = running.get()
         self._failures = self._wanted.failures()
         self._twice: int = self._wanted.option("twice") or TWICE[self._wanted.option("profile") or "ci"]
@@ -591,17 +600,21 @@ class ScheduleSearch:
                 self._learn(self._run(strategy_of("pct").choices(0) or Choices(0)))
             choices = self._strategy.choices(number)
             if choices is None:
-                self.is_complete = True
-                return
+                break
             self.runs += 1
             looks, is_twice = number % LOOKS == 0, number % self._twice == 0
             simulation = self._try(choices, looks=looks, notes=is_twice)
             self._learn(simulation)
             if is_twice:
                 self._check_repeats(simulation, looks=looks)
-        if self._named == "exhaustive" and self._strategy.choices(0) is not None:
-            text = f"{self.runs} schedules were tried, and there are more: raise seeds=, or make the system smaller"
-            warnings.warn(text, NotExhausted, stacklevel=3)
+        if self._named == "exhaustive":
+            self.is_complete, self.covered = self._strategy.choices(0) is None, self._strategy.covered(self.runs)
+            if self.is_complete:
+                print(self.covered)
+            else:
+                bound = "give" if self._settings.holds is None else "lower"
+                text = f"{self.covered}: raise seeds=, {bound} holds=, or make the system smaller"
+                warnings.warn(text, NotExhausted, stacklevel=3)
 
     def _learn(self, simulation: Simulation) -> None:
         self._strategy.learn(simulation.choices, simulation.trace)

@@ -15,6 +15,7 @@ from typing import Any, ClassVar, TypeVar
 try:
     from hypothesis import note
     from hypothesis.control import current_build_context, currently_in_test_context
+    from hypothesis.errors import HypothesisException
     from hypothesis.stateful import RuleBasedStateMachine, rule
 except ImportError as error:
     raise ImportError(
@@ -41,10 +42,12 @@ from ..schedules.bound_names import names_of
 from ..schedules.choices import ROUNDS, Choices, Production, as_text, from_text, repeated, require_fit
 from ..schedules.control import ControlledLoop
 from ..schedules.processes import SimulatedWorker
+from ..schedules.time_limits import is_of_time_limit
 from ..schedules.world import World
 from ..simulation import Simulation
 from ..wanted import running
 from .drawn import PAUSES, Drawn
+from .shrink_time import ShrinkTime
 
 A = TypeVar("A", bound=Actor)
 R = TypeVar("R")
@@ -52,7 +55,7 @@ T = TypeVar("T")
 
 OPTIONS: Mapping[str, Any] = {"intensity": 100}
 """Crashes are what a machine does: those of its rules do not end the tree, but an actor that crashes for ever does."""
-MEANT_FOR_SUBCLASSES = frozenset({"set_up", "teardown", "model", "options", "latency"})
+MEANT_FOR_SUBCLASSES = frozenset({"set_up", "teardown", "model", "options", "latency", "shrink_seconds"})
 
 
 class ActorMachine(RuleBasedStateMachine):
@@ -70,6 +73,8 @@ class ActorMachine(RuleBasedStateMachine):
         model: what the history has to obey; None: it is not judged.
         options: for ActorSystem. By default its root allows 100 restarts within its period.
         latency: as `simulate` takes it.
+        shrink_seconds: real seconds, >= 0, for which Hypothesis looks for a simpler example when one has failed.
+            What is shown says if that was cut short.
         system: the running system; `system.expect_crashes()` and the like say what is meant to happen.
         history: of all that was asked and told through the machine.
         faults: what `inject` injects.
@@ -78,6 +83,9 @@ class ActorMachine(RuleBasedStateMachine):
     model: ClassVar[Model[Any] | None] = None
     options: ClassVar[Mapping[str, Any]] = {}
     latency: ClassVar[Said] = 0.0
+    shrink_seconds: ClassVar[float] = 30.0
+
+    _shrinking: ClassVar[ShrinkTime] = ShrinkTime()
 
     system: GuardedSystem
     history: History
@@ -114,6 +122,8 @@ class ActorMachine(RuleBasedStateMachine):
         for name in vars(cls):
             if not name.startswith("_") and name in vars(ActorMachine) and name not in MEANT_FOR_SUBCLASSES:
                 raise TypeError(f"{cls.__name__}.{name} would hide ActorMachine.{name}: give it another name")
+        if not cls.shrink_seconds >= 0:
+            raise ValueError(f"{cls.__name__}.shrink_seconds must be >= 0 seconds, not {cls.shrink_seconds!r}")
 
     def _choices_of(self, schedule: str | None) -> Choices:
         if schedule is not None:
@@ -333,9 +343,18 @@ class ActorMachine(RuleBasedStateMachine):
     def _note(self, failure: BaseException | None) -> None:
         """Print how the example went, if it is the one that Hypothesis shows."""
         if self._recorder is None or failure is None:
+            if self._is_drawn and _is_failure(failure):
+                self._shrinking.begin(self.shrink_seconds)
             return
+        if self._shrinking.end():
+            note(f"shrinking was cut short after {self.shrink_seconds:g} s (`shrink_seconds`)")
         text = as_text(self._choices.seed, self._choices.kept())
         note(f'repeat it outside of Hypothesis with {type(self).__name__}(schedule="{text}")')
         chart = chart_as_text(leading(self._recorder, failure), self._recorder.rows)
         if chart:
             note(chart)
+
+
+def _is_failure(error: BaseException | None) -> bool:
+    """Whether an example has failed: Hypothesis ends one that it does not want by an error, too."""
+    return isinstance(error, Exception) and not isinstance(error, HypothesisException) and not is_of_time_limit(error)

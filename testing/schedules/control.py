@@ -20,6 +20,7 @@ from collections.abc import Callable, Hashable, Iterable
 from contextvars import Context
 from typing import TYPE_CHECKING, Any, Final, TypeVar, TypeVarTuple
 
+from ...actors.kernel import lifecycle
 from ...actors.kernel import loop as run_loop
 from ...actors.kernel.cell import Cell
 from ...actors.kernel.node import Node
@@ -29,11 +30,12 @@ from ..swaps import Swaps
 from .choices import Choices
 from .disk import simulated
 from .due import DueQueue, Option, TellingHandle
-from .footprints import Footprints
 from .livelock import Rounds
 from .numbered import NumberedFuture, NumberedTask
 from .places import SimulatedPlace, inside, is_dead, never, no_more
-from .strategies import Explored
+from .reduction.stepped import Stepped
+from .reduction.telling import TellingFuture, TellingTask
+from .reduction.watch import Watch
 from .world import EPOCH
 
 if TYPE_CHECKING:
@@ -145,6 +147,8 @@ class ControlledLoop(VirtualClockLoop):
         if sent:
             return True
         resting, self._resting = self._resting, []
+        if resting and self.control is not None and self.control.watch is not None:
+            self.control.watch.time_passes()
         for rest in resting:
             if not rest.done():
                 rest.set_result(None)
@@ -175,13 +179,27 @@ class ControlledLoop(VirtualClockLoop):
         self._wake_up()
         return handle
 
+    def call_at(
+        self, when: float, callback: Callable[[*Ts], object], *args: *Ts, context: Context | None = None
+    ) -> asyncio.TimerHandle:
+        """As every loop."""
+        handle = super().call_at(when, callback, *args, context=context)
+        if self.due.watch is not None:
+            self.due.watch.set_timer(handle)
+        return handle
+
     def _wake_up(self) -> None:
         wake: Callable[[], None] = getattr(self, "_write_to_self")  # noqa: B009  # asyncio's own, which no stub has
         wake()
 
     def create_future(self) -> asyncio.Future[Any]:
         """As every loop; the hash of the future is its number."""
-        future: NumberedFuture[Any] = NumberedFuture(loop=self)
+        watch = self.due.watch
+        if watch is None:
+            future: NumberedFuture[Any] = NumberedFuture(loop=self)
+        else:
+            future = TellingFuture(loop=self)
+            future.listener = watch
         future.number = next(self._numbers)
         return future
 
@@ -191,7 +209,11 @@ class ControlledLoop(VirtualClockLoop):
         if self.get_task_factory() is None:
             if self.is_closed():
                 raise RuntimeError("Event loop is closed")
-            task = NumberedTask(next(self._numbers), coro, loop=self, **options)
+            number, watch = next(self._numbers), self.due.watch
+            if watch is None:
+                task = NumberedTask(number, coro, loop=self, **options)
+            else:
+                task = TellingTask(watch, number, coro, loop=self, **options)
         else:
             task = super().create_task(coro, **options)
         context: Context | None = options.get("context")
@@ -252,10 +274,6 @@ class ControlledLoop(VirtualClockLoop):
         for task in dead:
             _close(task.get_coro())
         super().close()
-
-    def scheduled_timers(self) -> int:
-        """How many timers there are."""
-        return len(self._scheduled)
 
 
 def _close(coroutine: Any) -> None:
@@ -335,10 +353,13 @@ class Control:
         self._in_a_row = 0  # turns of that one
         self._nodes: dict[object, DrawnCells] = {}
         self._drained: DrawnCells | None = None  # where a turn was begun, after which nothing has been chosen yet
-        self._footprints: Footprints | None = None
-        if isinstance(choices, Explored):
-            self._footprints = choices.footprints = Footprints(node, loop)
+        self.watch: Watch | None = None
+        if isinstance(choices, Stepped):
+            self.watch = loop.due.watch = choices.watch = Watch(choices, node)
+            self._due.is_told = True
         self._swaps = Swaps()
+        if self.watch is not None:
+            self._swaps.put(lifecycle, "build", self.watch.build)
         self._swaps.put(run_loop, "clock", self._clock)
         for name in ("MOST", "STRIDE"):
             self._swaps.put(run_loop, name, 1)
@@ -363,7 +384,7 @@ class Control:
 
     def remove(self) -> None:
         """Let the rest of the run be as in production."""
-        self._loop.control = self._due.chooser = None
+        self._loop.control = self._due.chooser = self._due.watch = None
         self._loop.forget_ticks()  # All that were counted till now were others.
         self._swaps.undo()
         for node, cells in self._nodes.items():
@@ -417,8 +438,8 @@ class Control:
         if self._rounds is not None:
             self._rounds.step(cell)
         self._note(cell)
-        if self._footprints is not None:
-            self._footprints.touch(cell)
+        if self.watch is not None:
+            self.watch.turn(cell)
 
     def _clock(self) -> float:
         """The run loop's measure of its slices: asked before the first turn and after each."""
@@ -452,8 +473,6 @@ class Control:
             chosen = self._chosen(due)
         if self.next_cell is None:
             self._turns = 0
-            if self._footprints is not None:
-                self._footprints.touch(None)
         return chosen
 
     def _chosen(self, due: DueQueue) -> Option:
@@ -482,15 +501,22 @@ class Control:
 
     def called(self, option: Option) -> None:
         """A callback is called; if it is that of a node, its turns tell more."""
-        if self._rounds is not None and type(option[0]) is not Node:
-            self._rounds.step(option[0])
+        if type(option[0]) is not Node:
+            if self._rounds is not None:
+                self._rounds.step(option[0])
+            if self.watch is not None:
+                self.watch.callback(option)
+        elif self.watch is not None and not self._nodes.get(option[0]):
+            self.watch.callback(option)
 
     # -- the moment ---------------------------------------------------------------------------------------------------
 
     def begin_moment(self) -> None:
         """Virtual time has passed."""
-        self._rounds, self._moment, self._due.is_told = None, self._log.turns, False
+        self._rounds, self._moment, self._due.is_told = None, self._log.turns, self.watch is not None
         self.choose = self.choices.turn
+        if self.watch is not None:
+            self.watch.time_passes()
 
     def goes_on_for_ever(self, ticks: int) -> bool:
         """Whether it seems that virtual time will never pass, after so many ticks of the loop at this moment."""

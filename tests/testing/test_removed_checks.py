@@ -15,6 +15,7 @@ REPLAYS = "tests/testing/schedules/test_replays.py"
 SCHEDULES = "tests/testing/schedules/test_schedules.py"
 LATENCIES = "tests/testing/schedules/test_latencies.py"
 CHARTS = "tests/testing/charts/test_charts.py"
+EXHAUSTIVE = "tests/testing/schedules/test_exhaustive.py"
 ESCAPES = "tests/testing/schedules/test_escapes.py"
 
 CHECKS = {
@@ -255,6 +256,104 @@ CHECKS = {
         "1",
         REPLAYS,
         "test_a_profile_has_its_number",
+    ),
+    "only what races is tried in another order, and all of it": Check(
+        "testing/schedules/reduction/footprints.py",
+        "                if number >= begin:\n",
+        "                if False:\n",
+        EXHAUSTIVE,
+        "test_it_finds_whatever and two_tellers",
+    ),
+    "what is of one kind with what was tried sleeps": Check(
+        "testing/schedules/reduction/search.py",
+        "        if not number:\n            return {}\n",
+        "        if True:\n            return {}\n",
+        EXHAUSTIVE,
+        "test_schedules_that_differ_only",
+    ),
+    "what is on its way at the end of a test may come before": Check(
+        "testing/schedules/reduction/search.py",
+        "        if choices.has_ended and path:",
+        "        if False:",
+        EXHAUSTIVE,
+        "test_it_finds_whatever and a_time_out",
+    ),
+    "a bounded search holds up nobody once more than it may": Check(
+        "testing/schedules/reduction/bounded.py",
+        "        if self._holds < self._most:\n",
+        "        if True:\n",
+        EXHAUSTIVE,
+        "test_a_bound_is_what_it_covers",
+    ),
+    "a loop of a test that only waits has to do with nothing": Check(
+        "testing/schedules/reduction/watch.py",
+        "        if self._is_program and not self._is_pause():\n",
+        "        if self._is_program:\n",
+        EXHAUSTIVE,
+        "test_a_loop_that_only_waits",
+    ),
+    "actors may share what they were given": Check(
+        "testing/schedules/reduction/sharing.py",
+        " or not all(map(_is_fixed, (*start.args, *start.kwargs.values())))",
+        "",
+        EXHAUSTIVE,
+        "test_it_finds_whatever and a_list_that_actors",
+    ),
+    "actors may share what their code knows": Check(
+        "testing/schedules/reduction/sharing.py",
+        "    return _knows_shared(start.kind) or ",
+        "    return ",
+        EXHAUSTIVE,
+        "test_it_finds_whatever and a_list_that_the_code",
+    ),
+    "a test may look into an actor that it has got hold of": Check(
+        "testing/schedules/reduction/watch.py",
+        '                self._held.add(("actor", cell.path))\n',
+        "                pass\n",
+        EXHAUSTIVE,
+        "test_it_finds_whatever and the_test_looks",
+    ),
+    "random numbers come from one source": Check(
+        "testing/schedules/reduction/watch.py",
+        '            writes.add("random")\n',
+        "            pass\n",
+        EXHAUSTIVE,
+        "test_it_finds_whatever and numbers_of_one",
+    ),
+    "in which order outcomes are gathered changes nothing": Check(
+        "testing/schedules/reduction/watch.py",
+        "        if _is_gathered(callback) and _has_succeeded(*handle._args):",
+        "        if False:",
+        EXHAUSTIVE,
+        "test_two_lost_updates",
+    ),
+    "a runner that takes over a wait has to do with nothing": Check(
+        "testing/schedules/reduction/watch.py",
+        "                self._is_silent = True\n",
+        "                pass\n",
+        EXHAUSTIVE,
+        "test_two_lost_updates",
+    ),
+    "callbacks of a lane come as they were scheduled": Check(
+        "testing/schedules/reduction/stepped.py",
+        'Footprint(reads, writes | {("lane", lane)})',
+        "Footprint(reads, writes)",
+        EXHAUSTIVE,
+        "test_it_finds_whatever and the_first_of_two",
+    ),
+    "an order to an actor comes before its messages": Check(
+        "testing/schedules/reduction/watch.py",
+        "set() if step < 0 or self._stepped.was_ready(step, self.name(cell)) else {step}",
+        "set() if step < 0 else {step}",
+        EXHAUSTIVE,
+        "test_it_finds_whatever and a_stop",
+    ),
+    "whoever waits for what was there already goes on at once": Check(
+        "testing/schedules/reduction/telling.py",
+        "        self.listener.read(self.token)\n        return self._real.__await__()\n",
+        "        return self._real.__await__()\n",
+        EXHAUSTIVE,
+        "test_it_finds_whatever and an_outcome",
     ),
     "a set of refs has one order": Check(
         "actors/kernel/ref.py",

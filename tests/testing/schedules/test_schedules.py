@@ -150,7 +150,7 @@ def test_what_was_new_is_built_on() -> None:
 
 
 def test_the_exhaustive_search_sees_each_order_and_ends() -> None:
-    """Three tellers and one who notes: 3! orders of telling, and 5 ways in which the noting may lag behind each."""
+    """Three tellers and one who notes: 3! orders of telling; when each is noted changes nothing."""
     orders: Counter[tuple[int, ...]] = Counter()
 
     async def tells(system: GuardedSystem) -> None:
@@ -165,7 +165,7 @@ def test_the_exhaustive_search_sees_each_order_and_ends() -> None:
     search.run()
     assert search.is_complete
     assert set(orders) == set(itertools.permutations(range(3)))
-    assert search.runs == 30
+    assert search.runs == 6
 
 
 def test_an_exhaustive_search_that_is_not_over_says_so() -> None:
@@ -185,7 +185,7 @@ def test_turns_that_have_nothing_to_do_with_each_other_are_not_tried_in_every_or
     search = ScheduleSearch(pairs, OWN, SimulationSettings(1000, strategy="exhaustive"))
     search.run()
     assert search.is_complete
-    assert search.runs < 20
+    assert search.runs == 1
 
 
 @pytest.mark.parametrize("planted", [restart_order, order_of(4)])
