@@ -3,8 +3,7 @@
 It shows what the failing statement of the test looks at (refs, futures of asks, probes, actors), and the actors that
 the error names; if there are none, all that the test has heard. A turn follows from the one that sent what it handles,
 from the earlier turns of the same actor, from the replies that it waited for, from that which set its timer or started
-its actor. A turn that waits for a reply that did not come follows from whatever the one who was asked has done instead,
-and a turn that is not over at the end from all that it has waited for.
+its actor. A turn that waits for a reply that did not come follows from whatever the one who was asked has done instead.
 """
 
 from __future__ import annotations
@@ -46,8 +45,8 @@ def _behind(recorder: Recorder, rows: Iterable[int]) -> set[int]:
     for sent in recorder.sent:
         if not sent.is_answered and sent.row >= 0:
             unanswered.setdefault(sent.row, []).append(sent.to)
-    waiting, hanging = [(row, NEVER) for row in rows], recorder.hanging()
-    while waiting or (waiting := [(row, NEVER) for row in hanging if until.get(row, NEVER) < NEVER]):
+    waiting = [(row, NEVER) for row in rows]
+    while waiting:
         number, moment = waiting.pop()
         if until.get(number, -1) >= moment:
             continue

@@ -203,10 +203,6 @@ class Recorder(TurnWatcher):
 
         return noted
 
-    def hanging(self) -> list[int]:
-        """The turns that are not over."""
-        return [turn.number for turn in self._open.values()]
-
     def _answering(self, answer: Any) -> Any:
         @functools.wraps(answer)
         def noted(ask: Ask, reply: object) -> None:

@@ -206,6 +206,7 @@ def test_what_has_failed_is_tried_first_until_it_passes(pytester: pytest.Pyteste
         (("--holdfast-twice", "2"), 5, 2),
         (("--holdfast-profile", "nightly", "--holdfast-seeds", "5", "--holdfast-twice", "3"), 5, 3),
     ],
+    ids=["none", "ci", "nightly", "twice", "all"],
 )
 def test_a_profile_has_its_number_of_seeds_and_of_runs_made_twice(
     pytester: pytest.Pytester, args: tuple[str, ...], count: int, twice: int
