@@ -38,7 +38,7 @@ campaign: $(VENV)/.dev
 	HOLDFAST_REQUESTS=10000 HOLDFAST_STRIKES=2000 HOLDFAST_PROGRAMS=300 HOLDFAST_SOAK=60 HOLDFAST_REMOVED=1 \
 	    $(BIN)/python -m pytest -q -n 2 -s tests/ftm/test_campaign_faults.py tests/ftm/test_campaign.py \
 	    tests/ftm/test_random_hooks.py tests/ftm/test_soak.py tests/ftm/test_removed_checks.py
-	HOLDFAST_MATRIX=1700 HOLDFAST_LOADED_MOVES=50 HOLDFAST_BAD_CHANGES=1 $(BIN)/python -m pytest -q -n 2 -s \
+	HOLDFAST_TRAVELS=1000 HOLDFAST_LOADED_MOVES=50 HOLDFAST_BAD_CHANGES=1 $(BIN)/python -m pytest -q -n 2 -s \
 	    -o faulthandler_timeout=900 tests/migration tests/system/test_moves_under_load.py tests/ftm/test_bad_changes.py
 	HOLDFAST_TRANSACTIONS=1000 $(BIN)/python -m pytest -q -n 2 -s -o faulthandler_timeout=0 \
 	    tests/system/test_transactions_under_fire.py
