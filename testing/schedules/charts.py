@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from ...actors.kernel.cell import Cell
 from ...actors.kernel.envelope import Item
 from ...actors.kernel.message import message_of
+from ...actors.kernel.node import Node
 from ..library_code import is_module_of_library
 from ..turns import Substitute, TurnWatcher
 from .turn_log import told
@@ -18,7 +19,7 @@ SHOWN = 40
 """Turns that the text shows, the last ones."""
 WIDEST = 6
 """Columns of the text; where more actors take part, each row names who acts instead."""
-COLUMN = 16
+COLUMN = 20
 BRIEF = reprlib.Repr()
 BRIEF.maxother = BRIEF.maxstring = 60
 
@@ -44,15 +45,30 @@ class Recorder(TurnWatcher):
 
     def __init__(self) -> None:
         self.rows: list[ChartRow] = []
+        self._places: dict[object, str] = {}  # by node: what is written before its addresses
+        self._last: dict[str, str] = {}  # by address: in which of these places there was a turn last
         self._open: dict[Cell, tuple[int, int, dict[str, str]]] = {}
+
+    def call(self, node: Node, name: str) -> None:
+        """The program of a node has this name, or none."""
+        if name:
+            self._places[node] = f"{name}:"
 
     def begins(self, cell: Cell, item: Any) -> Substitute | None:
         message = message_of(item)
         what = told(cell, item) if message is None else BRIEF.repr(message)
         sender: Cell | None = item.sender if isinstance(item, Item) else None
         self._open[cell] = len(self.rows), cell.life, _state(cell)
-        self.rows.append(ChartRow(cell.node.loop.time(), cell.path, "" if sender is None else sender.path, what, ""))
+        place = self._places.get(cell.node, "")
+        source = "" if sender is None else self._place_of(sender, place) + sender.path
+        self._last[cell.path] = place
+        self.rows.append(ChartRow(cell.node.loop.time(), place + cell.path, source, what, ""))
         return None
+
+    def _place_of(self, sender: Cell, place: str) -> str:
+        """Where the sender of a message is that is handled in a place: there, or where its address had a turn last."""
+        is_here = sender.path.split("/", 2)[1:2] == [sender.node.name]
+        return place if is_here else self._last.get(sender.path, "")
 
     def ended(self, cell: Cell, item: Any) -> None:
         number, life, before = self._open.pop(cell, (-1, 0, {}))
@@ -92,8 +108,9 @@ def columns(rows: Sequence[ChartRow]) -> list[str]:
 
 
 def short(path: str) -> str:
-    """The end of an address."""
-    return path.rsplit("/", 1)[-1] or path
+    """The end of an address, behind the program that it is in, if that has a name."""
+    program, colon, address = path.rpartition(":")
+    return f"{program}{colon}{address.rsplit('/', 1)[-1] or address}"
 
 
 def as_text(rows: Sequence[ChartRow]) -> str:

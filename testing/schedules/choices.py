@@ -131,6 +131,39 @@ class Choices:
         return {kind: chosen for kind, chosen in found.items() if chosen}
 
 
+class Dice:
+    """Draws what happens in a run beside its order, by one seed.
+
+    Args:
+        what: the name of what is drawn for.
+        seed: decides it.
+        choices: of a simulated run: keeps what was drawn, and repeats it.
+
+    Attributes:
+        random: for what is not kept.
+    """
+
+    def __init__(self, what: str, seed: int, choices: Choices | None = None) -> None:
+        self.random = random.Random(f"{what} {seed}")
+        self._choices = choices
+
+    def strikes(self, share: float) -> bool:
+        """Draw whether a fault strikes of which this share does."""
+        if share <= 0.0:
+            return False
+        drawn = self.random.random() < share
+        return drawn if self._choices is None else bool(self._choices.draw(FAULT, 2, int(drawn)))
+
+    def seconds(self, least: float, longest: float) -> float:
+        """Draw how long something takes."""
+        if least == longest:
+            return least
+        if self._choices is None:
+            return self.random.uniform(least, longest)
+        level = self._choices.draw(DELAY, LEVELS, int(self.random.random() * LEVELS))
+        return least + (longest - least) * level / (LEVELS - 1)
+
+
 class Production(Choices):
     """As production does: in order of arrival."""
 

@@ -30,7 +30,7 @@ from .due import DueQueue, Option, TellingHandle
 from .footprints import Footprints
 from .livelock import Rounds
 from .numbered import NumberedFuture, NumberedTask
-from .places import SimulatedPlace, inside, is_dead, never, no_more
+from .places import SimulatedPlace, inside, is_dead, never, no_more, place_of
 from .strategies import Explored
 from .world import EPOCH
 
@@ -92,6 +92,7 @@ class ControlledLoop(VirtualClockLoop):
         self._resting: list[asyncio.Future[None]] = []
         self._dead: list[Any] = []  # tasks: kept, since what is collected is closed, which runs its code
         self.sync_seconds: Callable[[], float] = float  # that a sync of a simulated store takes: none
+        self.pipe_seconds: Callable[[], float] = float  # until what a process writes, or is written, arrives: none
 
     async def rest(self) -> None:
         """Wait until nothing else can happen at this moment: one tick more is not enough where others come first."""
@@ -206,11 +207,6 @@ class ControlledLoop(VirtualClockLoop):
         self.call_later(self.sync_seconds(), _do, done, work)
         return done
 
-    def add(self, place: SimulatedPlace) -> None:
-        """A place begins to run in this loop."""
-        if self.control is not None:
-            self.control.add(place.node)
-
     def drop(self, place: SimulatedPlace) -> None:
         """Nothing of this place runs any more."""
         place.is_dead = self.due.has_dead = True
@@ -219,16 +215,17 @@ class ControlledLoop(VirtualClockLoop):
             if is_dead(handle):
                 _close_unbegun(handle)
                 handle.cancel()
-        node = place.node
-        tasks: list[Any] = [*place.tasks, *(runner.task for runner in node._runners)]
+        tasks: list[Any] = [*place.tasks]
+        for node in place.nodes:
+            tasks += (runner.task for runner in node._runners)
+            node.wake = never  # type: ignore[method-assign]
+            node.idle_again = no_more  # type: ignore[method-assign]
+            if self.control is not None:
+                self.control.drop(node)
         for task in tasks:
             asyncio._unregister_task(task)  # Nobody waits for it, and it cleans nothing up.
             task._log_destroy_pending = False
         self._dead += tasks
-        node.wake = never  # type: ignore[method-assign]
-        node.idle_again = no_more  # type: ignore[method-assign]
-        if self.control is not None:
-            self.control.drop(node)
 
     def close(self) -> None:
         """As every loop. What was left of killed processes is collected now: Python runs the `finally` of each then."""
@@ -288,22 +285,24 @@ def _do(done: asyncio.Future[T], work: Callable[[], T]) -> None:
 class Control:
     """Has the choices of one run carried out, from here to `remove`.
 
+    The turns of every node of the loop are chosen, from when its actors have something to do for the first time.
+
     Args:
         choices: what decides.
         log: notes the turns.
-        node: of the root.
+        node: of the system that the test has; None: it has none.
         loop: whose steps are chosen.
-        on_node: called with each node whose turns are chosen.
+        on_node: called with each node whose turns are chosen, and what its place is called.
     """
 
     def __init__(
         self,
         choices: Choices,
         log: TurnLog,
-        node: Node,
+        node: Node | None,
         loop: ControlledLoop,
         *,
-        on_node: Callable[[Node], None] = lambda node: None,
+        on_node: Callable[[Node, str], None] = lambda node, name: None,
     ) -> None:
         self.choices = choices
         self.choose: Callable[[int, Keys], int] = choices.turn  # which of so many goes on
@@ -320,22 +319,30 @@ class Control:
         self._nodes: dict[object, DrawnCells] = {}
         self._drained: DrawnCells | None = None  # where a turn was begun, after which nothing has been chosen yet
         self._footprints: Footprints | None = None
-        if isinstance(choices, Explored):
+        if isinstance(choices, Explored) and node is not None:
             self._footprints = choices.footprints = Footprints(node, loop)
         self._swaps = Swaps()
         self._swaps.put(run_loop, "clock", self._clock)
         for name in ("MOST", "STRIDE"):
             self._swaps.put(run_loop, name, 1)
-        self.add(node)
+        if node is not None:
+            self.meet(node)
         loop.control = loop.due.chooser = self
 
-    def add(self, node: Node) -> None:
-        """The turns of this node are chosen, too: the root's, or that of a process."""
+    def meet(self, node: Node) -> None:
+        """The turns of this node are chosen, too, from now on."""
+        if node in self._nodes:
+            return
+        place = place_of(node)
+        name = "" if place is None else place.name
+        if place is not None and node not in place.nodes:
+            place.nodes.append(node)
+        self._log.call(node, name)
         cells = self._nodes[node] = DrawnCells(node.ready, self)
         self._swaps.put(node, "ready", cells)
         for name in ("most", "stride"):
             self._swaps.put(node, name, 1)  # One turn, and a look at the clock, which is where the next step is chosen.
-        self._on_node(node)
+        self._on_node(node, name)
 
     def drop(self, node: Node) -> None:
         """Nothing of this node has a turn any more."""

@@ -19,32 +19,10 @@ from ...checkpoint.journal import DamagedStore, Entry, Saved, StaleEpoch, StoreF
 from ...checkpoint.snapshot.shared_blocks import Segment
 from ...checkpoint.turn_word import blamed, is_at_work
 from ...cluster.store_contents import Change, MemoryContents
-from .choices import DELAY, LEVELS, LOSS, Choices
+from .choices import LOSS, Choices
 
 PATH: Final = "simulated"
 """The name of the store in errors, and in `simulate(store=...)`."""
-
-
-class Latency:
-    """Seconds that something takes, drawn anew each time.
-
-    Args:
-        choices: of the run.
-        what: the name of what takes them.
-        seconds: (least, longest).
-    """
-
-    def __init__(self, choices: Choices, what: str, seconds: tuple[float, float]) -> None:
-        self._choices, self._seconds = choices, seconds
-        self._draw = random.Random(f"{what} {choices.seed}")
-
-    def __call__(self) -> float:
-        """The seconds that it takes this time."""
-        least, longest = self._seconds
-        if least == longest:
-            return least
-        level = self._choices.draw(DELAY, LEVELS, int(self._draw.random() * LEVELS))
-        return least + (longest - least) * level / (LEVELS - 1)
 
 
 class SimulatedDisk:

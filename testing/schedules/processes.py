@@ -35,10 +35,7 @@ from ...actors.process.wire.connection import HIGH_BYTES, Connection
 from ...actors.process.worker_pool import Worker, Workers
 from ...checkpoint.life.recorded_context import RecordedContext
 from ...system.worker_main import WorkerComposition
-from ..swaps import Swaps
-from .choices import Choices
-from .disk import Latency
-from .places import SimulatedPlace, inside
+from .places import ProgramPlace, SimulatedPlace, inside
 
 if TYPE_CHECKING:
     from ...actors.kernel.node import Node
@@ -111,7 +108,7 @@ class Pipe(asyncio.Transport):
     # -- on the way -------------------------------------------------------------------------------------------------
 
     def _send(self, go: Callable[[], None]) -> None:
-        self._on_its_way.append((self._pool.loop.time() + self._pool.latency(), go))
+        self._on_its_way.append((self._pool.loop.time() + self._pool.loop.pipe_seconds(), go))
         if len(self._on_its_way) == 1:
             self._move()
 
@@ -180,7 +177,7 @@ class SimulatedProcess(SimulatedPlace):
     """
 
     def __init__(self, pid: int, pool: SimulatedWorkers) -> None:
-        super().__init__()
+        super().__init__(pool.place_name)
         self.pid, self.pool = pid, pool
         self.page = bytearray(PAGE_BYTES)
         self.context = Context()
@@ -213,7 +210,7 @@ class SimulatedProcess(SimulatedPlace):
         guest = self.guest = worker_node.Guest(
             loop, memoryview(self.page).cast("Q"), WorkerComposition, None, SimulatedEffectProcess
         )
-        self.node = guest.node
+        self.nodes.append(guest.node)
         theirs = Connection(guest.on_frame, guest.on_lost, guest.on_batch)
         guest.join(theirs)
         theirs.takers = guest.takers
@@ -317,19 +314,16 @@ class SimulatedWorkers(Workers):
 
     def __init__(self, node: Node, loop: ControlledLoop) -> None:
         super().__init__(node, "", [], on_frame, warm=0)
-        self.latency: Callable[[], float] = float  # none
         self.loop = loop
         self.root_context = copy_context()
+        place = inside.get()
+        self.place_name = "" if place is None else place.name
+        if isinstance(place, ProgramPlace):
+            place.pools.append(self)
         self._pids = itertools.count(FIRST_PID)
         self._processes: list[SimulatedProcess] = []
         self._stub = SimulatedServer()
-        self._swaps = Swaps()
-        self._swaps.put(worker_node, "_apply", _no_limits)
         self.effects = EffectProcesses(node.codec, SimulatedEffectProcess)
-
-    def draw_from(self, choices: Choices, seconds: tuple[float, float]) -> None:
-        """From now on what is written takes so many seconds, drawn, until it arrives."""
-        self.latency = Latency(choices, "latencies", seconds)
 
     async def arrived(self) -> bool:
         """Let time pass until what is on its way now has arrived. Returns whether anything was."""
@@ -348,7 +342,6 @@ class SimulatedWorkers(Workers):
     def born(self, process: SimulatedProcess) -> None:
         """A process has its node."""
         self._processes.append(process)
-        self.loop.add(process)
 
     async def close(self) -> None:
         await super().close()
@@ -358,8 +351,7 @@ class SimulatedWorkers(Workers):
         """Every process dies."""
         for process in self._processes:
             process.die(signal.SIGKILL)
-        self._swaps.undo()
 
 
-def _no_limits(limits: dict[str, Any]) -> None:
+def no_limits(limits: dict[str, Any]) -> None:
     """They would be the limits of the test's own process."""

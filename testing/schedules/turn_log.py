@@ -8,6 +8,7 @@ from typing import Any
 from ...actors.kernel.cell import NEXT_URGENT, Cell
 from ...actors.kernel.envelope import Ask
 from ...actors.kernel.message import Message, message_of
+from ...actors.kernel.node import Node
 from ...checkpoint.life.recorded_inbox import Fed
 
 
@@ -15,18 +16,24 @@ class TurnLog:
     """Notes each turn in a trace.
 
     Args:
-        trace: (address, what was handled) of each turn.
+        trace: (address, what was handled) of each turn; before the address that of which program, if it has a name.
     """
 
     def __init__(self, trace: list[tuple[str, str]]) -> None:
         self._trace = trace
         self._names: dict[type, str] = {}
+        self._places: dict[object, str] = {}  # what is written before the addresses of a node
         self._moments: list[tuple[int, asyncio.Future[None]]] = []  # after so many turns of the run
 
     @property
     def turns(self) -> int:
         """How many there have been."""
         return len(self._trace)
+
+    def call(self, node: Node, name: str) -> None:
+        """The place of a node has this name, or none."""
+        if name:
+            self._places[node] = f"{name}:"
 
     def note(self, cell: Cell) -> None:
         """A cell has the next turn."""
@@ -41,7 +48,8 @@ class TurnLog:
                 name = told(cell, item)
                 if isinstance(message, Message):
                     self._names[type(message)] = name
-            self._trace.append((cell.path, name))
+            place = self._places.get(cell.node)
+            self._trace.append((cell.path if place is None else place + cell.path, name))
 
     def await_turns(self, turns: int, moment: asyncio.Future[None]) -> None:
         """Have a future done after so many turns, if it is not done before."""
