@@ -13,7 +13,7 @@ from contextvars import Context, copy_context
 from types import TracebackType
 from typing import Any, TypeAlias
 
-from ...actors.errors import HoldfastError
+from ...actors.errors import HoldfastError, SpecError
 from ...cluster.leadership import LeadershipLost, Standby
 from ...cluster.lines.lines import Transport
 from ...cluster.ports import Engine, Unanswered
@@ -198,6 +198,7 @@ class SimFleet:
         post: carries what programs send each other.
         programs: all that were started and not killed.
         frames: what strikes programs where they send something; `Faults.on` installs it.
+        name: what faults call it.
 
     Args:
         seed: decides all that is drawn, by the global generator of `random`, too: the context seeds that meanwhile.
@@ -218,11 +219,14 @@ class SimFleet:
         self.draw = random.Random(f"fleet {seed}")
         self.post = SimPost(seed, post_faults, choices=choices)
         self.frames = FrameFaults(self.later)
+        self.name = "the fleet"
         self._nowhere = Context()
         self.programs: list[SimProgram] = []
         self._brokers: dict[str, SimBroker] = {}
         self._ending: list[SimProgram] = []
         self._started = 0
+        self._successors: dict[SimProgram, Callable[[], None]] = {}
+        self._is_closing = False
 
     def broker(self, system: str = "app") -> SimBroker:
         """The servers of a system, which outlive every program: `faults`, `go_away`, `expire_lease`."""
@@ -235,17 +239,29 @@ class SimFleet:
         """The servers of a system, for `hf.connect(fleet.servers("app"))` or for a program of your own."""
         return SimServers(self.broker(system), self.post, system)
 
-    def start(self, body: Body, system: str = "app") -> SimProgram:
+    def start(self, body: Body, system: str = "app", *, again: float | None = None) -> SimProgram:
         """Start one program more: `body` is its `main`, and runs again when another program has come to lead.
 
         Args:
             body: gets the program, and enters `program.open(...)`.
             system: of which system the servers are.
+            again: seconds after which another one is started in its place when it is killed; None: none is.
+
+        Raises:
+            SpecError: `again` is no such number.
         """
+        if again is not None and not again >= 0.0:
+            raise SpecError("SimFleet.start", f"again= must be a number of seconds from 0 on, not {again!r}")
         self._started += 1
         program = SimProgram(f"program {self._started}", self, self.servers(system), body)
         self.programs.append(program)
+        if again is not None:
+            self._successors[program] = lambda: self.later(again, lambda: self._start_again(body, system, again))
         return program
+
+    def _start_again(self, body: Body, system: str, again: float) -> None:
+        if not self._is_closing:
+            self.start(body, system, again=again)
 
     def later(self, seconds: float, call: Callable[[], None]) -> None:
         """Have something done so many seconds later, whichever programs have died meanwhile."""
@@ -279,6 +295,9 @@ class SimFleet:
         self.programs.remove(program)
         self._ending.append(program)
         program.kill()
+        succeed = self._successors.pop(program, None)
+        if succeed is not None:
+            succeed()
 
     def leader(self) -> SimProgram | None:
         """The program that leads, as far as is known here: the last one that has begun to."""
@@ -312,6 +331,7 @@ class SimFleet:
         """
         for broker in self._brokers.values():
             broker.faults = NO_FAULTS
+        self._is_closing = True
         left, self.programs = self.programs, []
         self.post.join_all()
         for program in left:

@@ -90,6 +90,7 @@ class ControlledLoop(VirtualClockLoop):
         self._sent: deque[asyncio.Handle] = deque()  # by threads
         self._work: dict[asyncio.Future[Any], int] = {}  # of anyio's threads, by when it was given
         self._resting: list[asyncio.Future[None]] = []
+        self._is_ending = False
         self._dead: list[Any] = []  # tasks: kept, since what is collected is closed, which runs its code
         self.sync_seconds: Callable[[], float] = float  # that a sync of a simulated store takes: none
         self.pipe_seconds: Callable[[], float] = float  # until what a process writes, or is written, arrives: none
@@ -186,6 +187,9 @@ class ControlledLoop(VirtualClockLoop):
     def create_task(self, coro: Any, **options: Any) -> asyncio.Task[Any]:
         """As every loop; the hash of the task is its number."""
         task: asyncio.Task[Any]
+        if self._is_ending:  # By the `finally` of what was killed: nobody runs it.
+            _close(coro)
+            raise RuntimeError("Event loop is closed")
         if self.get_task_factory() is None:
             if self.is_closed():
                 raise RuntimeError("Event loop is closed")
@@ -196,6 +200,8 @@ class ControlledLoop(VirtualClockLoop):
         place = inside.get() if context is None else context.get(inside)
         if place is not None:
             place.tasks.add(task)
+            if place.is_dead:  # In the step in which it has died.
+                self._bury(task)
         return task
 
     def run_in_executor(self, executor: Any, func: Callable[[*Ts], T], *args: *Ts) -> asyncio.Future[T]:
@@ -223,12 +229,17 @@ class ControlledLoop(VirtualClockLoop):
             if self.control is not None:
                 self.control.drop(node)
         for task in tasks:
-            asyncio._unregister_task(task)  # Nobody waits for it, and it cleans nothing up.
-            task._log_destroy_pending = False
-        self._dead += tasks
+            self._bury(task)
+
+    def _bury(self, task: Any) -> None:
+        """Nobody waits for a task, and it cleans nothing up."""
+        asyncio._unregister_task(task)
+        task._log_destroy_pending = False
+        self._dead.append(task)
 
     def close(self) -> None:
         """As every loop. What was left of killed processes is collected now: Python runs the `finally` of each then."""
+        self._is_ending = True
         dead, self._dead = self._dead, []
         for task in dead:
             _close(task.get_coro())
@@ -340,8 +351,8 @@ class Control:
         self._log.call(node, name)
         cells = self._nodes[node] = DrawnCells(node.ready, self)
         self._swaps.put(node, "ready", cells)
-        for name in ("most", "stride"):
-            self._swaps.put(node, name, 1)  # One turn, and a look at the clock, which is where the next step is chosen.
+        for limit in ("most", "stride"):
+            self._swaps.put(node, limit, 1)  # One turn, and a look at the clock, which is where the next step is chosen.
         self._on_node(node, name)
 
     def drop(self, node: Node) -> None:

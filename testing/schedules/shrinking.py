@@ -1,7 +1,7 @@
 """Shrinking: the same failure with as few choices as possible that differ from what production would do.
 
-Faults go first, then turns, in halves, quarters, and singly, as long as the failure stays; what is left is all that it
-takes. Source: delta debugging (Zeller and Hildebrandt, IEEE TSE 2002).
+Faults go first, then turns: each kind as a whole, then in halves, quarters, and singly, as long as the failure stays;
+what is left is all that it takes. Source: delta debugging (Zeller and Hildebrandt, IEEE TSE 2002).
 """
 
 from __future__ import annotations
@@ -43,6 +43,10 @@ def shrink(taken: Taken, fails: Callable[[Taken], Taken | None], seconds: float 
 
     if best and (made := tried([])) is not None:
         return _taken(made)
+    for kind in ORDER:
+        others = [item for item in best if item[0] != kind]
+        if 0 < len(others) < len(best) and now() < end and (made := tried(others)) is not None:
+            best = made if len(made) < len(best) else best
     size = max(1, len(best) // 2)
     while best and now() < end and runs < RUNS:
         at, shorter = 0, False
