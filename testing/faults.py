@@ -20,7 +20,7 @@ from .schedules.choices import DELAY, FAULT, LEVELS, Choices
 if TYPE_CHECKING:
     from .fleet.sim_fleet import SimFleet, SimProgram
 
-Kind = Literal["crash", "hang", "delay", "drop", "duplicate", "reorder", "corrupt", "fail", "cut"]
+Kind = Literal["crash", "hang", "delay", "drop", "duplicate", "reorder", "corrupt", "fail", "cut", "split"]
 KINDS: tuple[str, ...] = get_args(Kind)
 
 
@@ -100,13 +100,13 @@ POINTS: dict[str, Point] = {
         Point(
             "post",
             "what a program of a simulated fleet sends another program, or a client",
-            ("crash", "cut", "drop", "delay", "duplicate"),
-            "crash, cut: another program leads; an ask to a recorded actor has one outcome, the others may be lost",
+            ("crash", "cut", "split", "drop", "delay", "duplicate"),
+            "crash, cut, split: another program leads; an ask to a recorded actor has one outcome, the others may be lost",
         ),
         Point(
             "request",
             "what such a program asks of the servers of its system: for the log, the lease and large values",
-            ("crash", "cut", "drop"),
+            ("crash", "cut", "split", "drop"),
             "what was acknowledged stands in the log, and whoever leads next has it",
         ),
     )
@@ -194,6 +194,11 @@ class Strikes:
             level = self._faults.choices.draw(DELAY, LEVELS, level)
         return self.least + (self.longest - self.least) * level / (LEVELS - 1)
 
+    def is_hit(self) -> bool:
+        """Draw whether one more is hit by a fault that strikes several: half of them are."""
+        drawn = self.draw.random() < 0.5
+        return drawn if self._faults.choices is None else bool(self._faults.choices.draw(FAULT, 2, int(drawn)))
+
     def crash(self) -> InjectedCrash:
         """Return the exception of a crash that strikes now."""
         return InjectedCrash(self.at, self.chances, self.seed)
@@ -266,8 +271,8 @@ class Faults:
             times: at most so many strikes; None: no limit.
             replays: at "turn begin" and "turn end": the turns of a replay are chances, too. Left out, only turns that
                 no life has ended before are.
-            odds: by kind of fault (crash, hang, delay, drop, duplicate, reorder, corrupt, fail, cut), the probability
-                with which it strikes at each chance; together at most 1.
+            odds: by kind of fault (crash, hang, delay, drop, duplicate, reorder, corrupt, fail, cut, split), the
+                probability with which it strikes at each chance; together at most 1.
 
         Raises:
             SpecError: there is no such point, the fault cannot strike there, or the target has no such point.

@@ -150,7 +150,7 @@ class SimBroker:
         """Append a record behind the last one; see `Log`."""
         if after != self._last or self.dice.strikes(self.faults.refused):
             raise OutOfTurn(after)
-        self._last += 1 + self.dice.strikes(0.1)  # Numbers may have gaps.
+        self._last += 1 + (self.dice.random.random() < 0.1)  # Numbers may have gaps.
         self._log.append(_Kept(LogRecord(self._last, data), _now(), self._begins))
         for one in self._waiting:
             if not one.done():

@@ -61,6 +61,9 @@ class FrameFaults:
                 case "cut":
                     self._cut(strikes, program)
                     return LOST
+                case "split":
+                    self._split(strikes, program)
+                    return LOST
                 case "delay":
                     return Fate(1, strikes.delay())
                 case "duplicate":
@@ -78,5 +81,13 @@ class FrameFaults:
             if not program.is_killed:
                 servers.heal(log=is_log, lines=not is_log)
 
+        self._later(strikes.delay(), heal)
+        strikes.at_end(heal)
+
+    def _split(self, strikes: Strikes, program: SimProgram) -> None:
+        """Leave a program behind, with others that are drawn, until its seconds are over, or the faults are."""
+        fleet = program.fleet
+        others = [one for one in fleet.parties if one is not program.servers]
+        heal = fleet.split(program, *(one for one in others if strikes.is_hit()))
         self._later(strikes.delay(), heal)
         strikes.at_end(heal)

@@ -70,7 +70,8 @@ class SimPost:
         self.faults, self.latency = faults, latency
         self._dice = Dice("post", seed, choices)
         self._hearers: dict[str, list[Hearer]] = {}
-        self._apart: set[frozenset[object]] = set()
+        self._cuts: list[frozenset[object]] = []
+        self._splits: list[frozenset[object]] = []
         self._due: dict[tuple[str, str], float] = {}
         self._places = 0
         self._nowhere = Context()  # What is on its way arrives, whatever becomes of the program that has sent it.
@@ -79,7 +80,7 @@ class SimPost:
         """A way to the post.
 
         Args:
-            owner: whose it is, as `part` and `join` know it.
+            owner: whose it is, as `cut` and `split` know it.
             fate: asked what becomes of what is sent to a place.
         """
         self._places += 1
@@ -94,21 +95,22 @@ class SimPost:
         for at, hearers in self._hearers.items():
             self._hearers[at] = [one for one in hearers if one.by is not transport]
 
-    def part(self, one: object, other: object) -> None:
-        """Let nothing through between two owners any more, until `join`."""
-        self._apart.add(frozenset((one, other)))
+    def cut(self, one: object, other: object) -> None:
+        """Let nothing through between two owners any more."""
+        self._cuts.append(frozenset((one, other)))
 
-    def join(self, one: object, other: object) -> None:
-        """Let everything through between two owners again."""
-        self._apart.discard(frozenset((one, other)))
+    def split(self, some: frozenset[object]) -> None:
+        """Let nothing through between some owners and all others."""
+        self._splits.append(some)
 
-    def join_all(self) -> None:
+    def unite(self, some: frozenset[object]) -> None:
+        """Let everything through again between some owners and all others."""
+        self._splits.remove(some)
+
+    def heal(self) -> None:
         """Let everything through again."""
-        self._apart.clear()
-
-    def are_apart(self, one: object, other: object) -> bool:
-        """Whether nothing gets through between two owners."""
-        return frozenset((one, other)) in self._apart
+        self._cuts.clear()
+        self._splits.clear()
 
     def post(self, sender: SimTransport, to: str, data: bytes, back: str) -> None:
         """Carry bytes to a place."""
@@ -127,15 +129,23 @@ class SimPost:
             self._carry(due + (late or dice.seconds(0.0, faults.late_seconds)), sender, to, data, back)
 
     def _carry(self, when: float, sender: SimTransport, to: str, data: bytes, back: str) -> None:
-        own = sender.owner
-        apart = [other for pair in self._apart if own in pair for other in pair if other is not own]
+        cuts, splits = [*self._cuts], [*self._splits]  # What is sent across one of these is lost, also if that heals.
         loop = asyncio.get_running_loop()
-        loop.call_at(when, self._arrive, sender, apart, to, data, back, context=self._nowhere)
+        loop.call_at(when, self._arrive, sender.owner, cuts, splits, to, data, back, context=self._nowhere)
 
-    def _arrive(self, sender: SimTransport, apart: list[object], to: str, data: bytes, back: str) -> None:
+    def _arrive(
+        self,
+        sender: object,
+        cuts: list[frozenset[object]],
+        splits: list[frozenset[object]],
+        to: str,
+        data: bytes,
+        back: str,
+    ) -> None:
         for hearer in tuple(self._hearers.get(to, ())):
             owner = hearer.by.owner
-            if not hearer.by.is_cut and owner not in apart and not self.are_apart(sender.owner, owner):
+            is_lost = hearer.by.is_cut or any({sender, owner} == pair for pair in (*cuts, *self._cuts))
+            if not is_lost and all((sender in some) == (owner in some) for some in (*splits, *self._splits)):
                 hearer.context.run(hearer.take, data, back)
 
 

@@ -188,6 +188,10 @@ class SimProgram(ProgramPlace):
             self._task.result()
 
 
+Party: TypeAlias = SimProgram | SimServers
+"""A program, or a client by its servers."""
+
+
 class SimFleet:
     """Programs, and the simulated servers by which they are one system, or several. For the virtual clock.
 
@@ -199,6 +203,7 @@ class SimFleet:
         programs: all that were started and not killed.
         frames: what strikes programs where they send something; `Faults.on` installs it.
         name: what faults call it.
+        parties: the servers as each program that was not killed, and each client, reaches them.
 
     Args:
         seed: decides all that is drawn, by the global generator of `random`, too: the context seeds that meanwhile.
@@ -220,11 +225,13 @@ class SimFleet:
         self.post = SimPost(seed, post_faults, choices=choices)
         self.frames = FrameFaults(self.later)
         self.name = "the fleet"
+        self.parties: list[SimServers] = []
         self._nowhere = Context()
         self.programs: list[SimProgram] = []
         self._brokers: dict[str, SimBroker] = {}
         self._ending: list[SimProgram] = []
         self._started = 0
+        self._splits: list[frozenset[SimServers]] = []
         self._successors: dict[SimProgram, Callable[[], None]] = {}
         self._is_closing = False
 
@@ -237,7 +244,9 @@ class SimFleet:
 
     def servers(self, system: str = "app") -> SimServers:
         """The servers of a system, for `hf.connect(fleet.servers("app"))` or for a program of your own."""
-        return SimServers(self.broker(system), self.post, system)
+        made = SimServers(self.broker(system), self.post, system)
+        self.parties.append(made)
+        return made
 
     def start(self, body: Body, system: str = "app", *, again: float | None = None) -> SimProgram:
         """Start one program more: `body` is its `main`, and runs again when another program has come to lead.
@@ -275,13 +284,37 @@ class SimFleet:
         """Have nothing of a program reach anybody any more."""
         program.cancel()
 
-    def cut(self, one: SimProgram | SimServers, other: SimProgram | SimServers) -> None:
-        """Let nothing through between two programs, or a program and a client (by its servers), until `heal`."""
-        self.post.part(_servers_of(one), _servers_of(other))
+    def cut(self, one: Party, other: Party) -> None:
+        """Let nothing through any more between two programs, or clients (by their servers), until `heal`."""
+        self.post.cut(_servers_of(one), _servers_of(other))
 
-    def heal(self, one: SimProgram | SimServers, other: SimProgram | SimServers) -> None:
-        """Let everything through again between two that were cut off from each other."""
-        self.post.join(_servers_of(one), _servers_of(other))
+    def split(self, *minority: Party) -> Callable[[], None]:
+        """Leave these programs and clients among themselves: they reach no servers of the log, and nobody else.
+
+        Returns what ends that; `heal` does so, too.
+        """
+        behind = frozenset(_servers_of(one) for one in minority)
+        self._splits.append(behind)
+        self.post.split(behind)
+        for one in behind:
+            one.link.cut()
+
+        def heal() -> None:
+            if behind in self._splits:
+                self._splits.remove(behind)
+                self.post.unite(behind)
+                for one in behind:
+                    if not any(one in split for split in self._splits):
+                        one.link.heal()
+
+        return heal
+
+    def heal(self) -> None:
+        """Let everything through again, whatever has been cut and split."""
+        self.post.heal()
+        self._splits.clear()
+        for one in self.parties:
+            one.heal()
 
     def kill(self, program: SimProgram | None) -> None:
         """End a program as SIGKILL does.
@@ -293,6 +326,7 @@ class SimFleet:
             why = "this one does not" if program is not None else "nobody leads; wait until `leader()` is not None"
             raise HoldfastError(f"SimFleet.kill takes a program that runs in this fleet: {why}")
         self.programs.remove(program)
+        self.parties.remove(program.servers)
         self._ending.append(program)
         program.kill()
         succeed = self._successors.pop(program, None)
@@ -333,9 +367,8 @@ class SimFleet:
             broker.faults = NO_FAULTS
         self._is_closing = True
         left, self.programs = self.programs, []
-        self.post.join_all()
+        self.heal()
         for program in left:
-            program.servers.heal()
             program.servers.link.thaw()
             program.stop()
         for program in self._ending:
@@ -345,5 +378,5 @@ class SimFleet:
         await asyncio.sleep(LONGEST_END)  # What was late has arrived, and journals have let go of their servers.
 
 
-def _servers_of(one: SimProgram | SimServers) -> SimServers:
+def _servers_of(one: Party) -> SimServers:
     return one.servers if isinstance(one, SimProgram) else one

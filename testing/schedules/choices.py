@@ -26,13 +26,16 @@ PATIENCE: Final = 1000
 """Choices after which nobody is held up any more: whoever runs may be waiting for them."""
 FAULT: Final = "fault"
 DELAY: Final = "delay"
+"""How long a fault lasts."""
+LATENCY: Final = "latency"
+"""How long what is written takes until it arrives, or is safe."""
 MOMENT: Final = "moment"
 """After how many turns something happens that the test does."""
 LOSS: Final = "loss"
 """How many of the writes that were not synced a power cut takes."""
 ROUNDS: Final = "rounds"
 """How long the system goes on after a step of a machine."""
-KINDS: Final = (TURN, HOLD, FAULT, DELAY, MOMENT, LOSS, ROUNDS)
+KINDS: Final = (TURN, HOLD, FAULT, DELAY, LATENCY, MOMENT, LOSS, ROUNDS)
 LEVELS: Final = 64
 """So many different delays can be drawn of one range."""
 
@@ -160,7 +163,7 @@ class Dice:
             return least
         if self._choices is None:
             return self.random.uniform(least, longest)
-        level = self._choices.draw(DELAY, LEVELS, int(self.random.random() * LEVELS))
+        level = self._choices.draw(LATENCY, LEVELS, int(self.random.random() * LEVELS))
         return least + (longest - least) * level / (LEVELS - 1)
 
 

@@ -1,6 +1,6 @@
 """Shrinking: the same failure with as few choices as possible that differ from what production would do.
 
-Faults go first, then turns: each kind as a whole, then in halves, quarters, and singly, as long as the failure stays;
+Latencies go first, then faults, then turns: each kind as a whole, then in halves, quarters, and singly, as long as the failure stays;
 what is left is all that it takes. Source: delta debugging (Zeller and Hildebrandt, IEEE TSE 2002).
 """
 
@@ -9,12 +9,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from .choices import DELAY, FAULT, HOLD, LOSS, MOMENT, TURN, Taken
+from .choices import DELAY, FAULT, HOLD, LATENCY, LOSS, MOMENT, TURN, Taken
 
 SECONDS = 10.0
 """Real seconds that shrinking may take."""
 RUNS = 1000
-ORDER = (FAULT, LOSS, DELAY, MOMENT, TURN, HOLD)
+ORDER = (LATENCY, FAULT, LOSS, DELAY, MOMENT, TURN, HOLD)
 
 Item = tuple[str, int, int]
 now = time.perf_counter
