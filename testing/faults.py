@@ -194,6 +194,11 @@ class Strikes:
             level = self._faults.choices.draw(DELAY, LEVELS, level)
         return self.least + (self.longest - self.least) * level / (LEVELS - 1)
 
+    def tell(self, what: str) -> None:
+        """Say more of what the last fault has hit."""
+        told = self.struck[-1]._replace(what=what)
+        self.struck[-1] = self._faults.strikes[-1] = told
+
     def is_hit(self) -> bool:
         """Draw whether one more is hit by a fault that strikes several: half of them are."""
         drawn = self.draw.random() < 0.5

@@ -30,6 +30,16 @@ AS_USUAL: Final = Fate()
 LOST: Final = Fate(0)
 
 
+class Sent(NamedTuple):
+    """What a program sends, as strikes show it."""
+
+    program: str
+    to: str
+
+    def __repr__(self) -> str:
+        return f"what {self.program} sends to {self.to}"
+
+
 class FrameFaults:
     """What strikes the programs of one fleet where they send something.
 
@@ -52,7 +62,7 @@ class FrameFaults:
         for strikes, target in self._installed:
             if program is None or strikes.at != at or target not in (None, program):
                 continue
-            match strikes.next(f"{program.name} to {what}"):
+            match strikes.next(Sent(program.name, what)):
                 case None:
                     continue
                 case "crash":
@@ -88,6 +98,8 @@ class FrameFaults:
         """Leave a program behind, with others that are drawn, until its seconds are over, or the faults are."""
         fleet = program.fleet
         others = [one for one in fleet.parties if one is not program.servers]
-        heal = fleet.split(program, *(one for one in others if strikes.is_hit()))
+        behind = [program.servers, *(one for one in others if strikes.is_hit())]
+        strikes.tell(f"left behind: {', '.join(one.name for one in behind)}")
+        heal = fleet.split(*behind)
         self._later(strikes.delay(), heal)
         strikes.at_end(heal)

@@ -46,13 +46,14 @@ class SimServers:
 
     Attributes:
         system: what the system is called.
+        name: who reaches them so, for people.
         link: what gets through to the log, the lease and the large values, and back.
         transports: ways to other programs; each may be cut.
         fate: asked what becomes of what is sent: at which point, and to whom.
     """
 
-    def __init__(self, broker: SimBroker, post: SimPost, system: str) -> None:
-        self.system = system
+    def __init__(self, broker: SimBroker, post: SimPost, system: str, name: str) -> None:
+        self.system, self.name = system, name
         self.link = SimLink()
         self.link.is_struck = lambda: not self.fate(REQUEST, f"the servers of {system}").copies
         self.transports: list[SimTransport] = []
@@ -230,7 +231,7 @@ class SimFleet:
         self.programs: list[SimProgram] = []
         self._brokers: dict[str, SimBroker] = {}
         self._ending: list[SimProgram] = []
-        self._started = 0
+        self._started = self._clients = 0
         self._splits: list[frozenset[SimServers]] = []
         self._successors: dict[SimProgram, Callable[[], None]] = {}
         self._is_closing = False
@@ -244,7 +245,11 @@ class SimFleet:
 
     def servers(self, system: str = "app") -> SimServers:
         """The servers of a system, for `hf.connect(fleet.servers("app"))` or for a program of your own."""
-        made = SimServers(self.broker(system), self.post, system)
+        self._clients += 1
+        return self._reached(system, f"client {self._clients}")
+
+    def _reached(self, system: str, by: str) -> SimServers:
+        made = SimServers(self.broker(system), self.post, system, by)
         self.parties.append(made)
         return made
 
@@ -262,7 +267,8 @@ class SimFleet:
         if again is not None and not again >= 0.0:
             raise SpecError("SimFleet.start", f"again= must be a number of seconds from 0 on, not {again!r}")
         self._started += 1
-        program = SimProgram(f"program {self._started}", self, self.servers(system), body)
+        name = f"program {self._started}"
+        program = SimProgram(name, self, self._reached(system, name), body)
         self.programs.append(program)
         if again is not None:
             self._successors[program] = lambda: self.later(again, lambda: self._start_again(body, system, again))
