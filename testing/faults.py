@@ -101,7 +101,7 @@ POINTS: dict[str, Point] = {
             "post",
             "what a program of a simulated fleet sends another program, or a client",
             ("crash", "cut", "split", "drop", "delay", "duplicate"),
-            "crash, cut, split: another program leads; an ask to a recorded actor has one outcome, the others may be lost",
+            "crash, cut, split: another program leads; an ask to a recorded actor has one outcome",
         ),
         Point(
             "request",

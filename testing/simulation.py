@@ -33,9 +33,9 @@ from ..actors.kernel.ref import ActorRef, current
 from ..actors.process import worker_node
 from .clock import TICKS
 from .faults import Faults
+from .fleet.guarded_fleet import GuardedFleet
 from .guard.leaks import Leaks
 from .guard.loop_leaks import LoopLeaks
-from .fleet.guarded_fleet import GuardedFleet
 from .guarded import GuardedSystem, UnexpectedEnd
 from .library_code import is_file_of_library
 from .schedules.bound_names import BoundNames, names_of
@@ -481,8 +481,9 @@ def simulate(
     """Run an async test under many schedules, each on a virtual clock with a system of its own.
 
     The test takes `system` (a running GuardedSystem), or `fleet` (a GuardedFleet: programs on simulated servers), or
-    both, and, if it names them, `faults` (the seed's `Faults`) and `simulation`. Whatever else it takes are fixtures; they are made once, for all seeds, and must not be async. What
-    the marker `holdfast` says holds for each seed. `@given` may stand above: each example runs under all seeds.
+    both, and, if it names them, `faults` (the seed's `Faults`) and `simulation`. Whatever else it takes are fixtures;
+    they are made once, for all seeds, and must not be async. What the marker `holdfast` says holds for each seed.
+    `@given` may stand above: each example runs under all seeds.
 
     A test is run more often than there are seeds: some runs are made twice, and a failing one is repeated while it is
     shrunk. What it leaves in its surroundings must not change the next run.

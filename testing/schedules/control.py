@@ -352,7 +352,9 @@ class Control:
         cells = self._nodes[node] = DrawnCells(node.ready, self)
         self._swaps.put(node, "ready", cells)
         for limit in ("most", "stride"):
-            self._swaps.put(node, limit, 1)  # One turn, and a look at the clock, which is where the next step is chosen.
+            self._swaps.put(
+                node, limit, 1
+            )  # One turn, and a look at the clock, which is where the next step is chosen.
         self._on_node(node, name)
 
     def drop(self, node: Node) -> None:

@@ -1,7 +1,7 @@
 """Shrinking: the same failure with as few choices as possible that differ from what production would do.
 
-Latencies go first, then faults, then turns: each kind as a whole, then in halves, quarters, and singly, as long as the failure stays;
-what is left is all that it takes. Source: delta debugging (Zeller and Hildebrandt, IEEE TSE 2002).
+Latencies go first, then faults, then turns: each kind as a whole, then in halves, quarters, and singly, as long as the
+failure stays; what is left is all that it takes. Source: delta debugging (Zeller and Hildebrandt, IEEE TSE 2002).
 """
 
 from __future__ import annotations
