@@ -160,6 +160,21 @@ def test_nothing_of_a_killed_program_runs() -> None:
     simulate(killed, seeds=3)()
 
 
+def test_what_a_program_has_sent_arrives_after_its_end() -> None:
+    async def killed(fleet: GuardedFleet) -> None:
+        program = fleet.start(plain)
+        async with hf.connect(fleet.servers(), timeout=60.0) as connection:
+            ref = connection.ref("/app/sum", Sum)
+            assert await ref.ask(Add(1)) == 1
+            fleet.post.latency = (1.0, 1.0)
+            asked = ref.ask(Add(1), timeout=20.0)
+            await asyncio.sleep(1.5)
+            fleet.kill(program)
+            assert await asked == 2
+
+    simulate(killed, seeds=2)()
+
+
 @pytest.mark.parametrize("at", ["post", "request"])
 def test_a_program_that_dies_where_it_sends_something_sends_nothing_more(at: str) -> None:
     async def struck(fleet: GuardedFleet, faults: Faults) -> None:
