@@ -170,6 +170,8 @@ class Simulation:
         loop = asyncio.get_running_loop()
         assert isinstance(loop, ControlledLoop)
         has_fleet = "fleet" in own
+        if has_fleet and "system" not in own and options.get("store") is not None:
+            raise SpecError("simulate", "store= is of the system of the test; that of a fleet are its own servers")
         self._store = options.get("store")  # The marker of the test may name it, too.
         if self._store == PATH:
             self.disk = SimulatedDisk()

@@ -59,8 +59,10 @@ class FrameFaults:
 
     def fate(self, at: str, program: SimProgram | None, what: str) -> Fate:
         """Draw what becomes of something that a program sends; whatever strikes that program has struck then."""
+        if program is None or program not in program.fleet.programs:  # It was stopped, or killed.
+            return AS_USUAL
         for strikes, target in self._installed:
-            if program is None or strikes.at != at or target not in (None, program):
+            if strikes.at != at or target not in (None, program):
                 continue
             match strikes.next(Sent(program.name, what)):
                 case None:

@@ -58,7 +58,8 @@ class GuardedFleet(SimFleet):
         self.expected.expect_exceptions()
 
     def make_system(self, name: str, options: dict[str, Any]) -> ActorSystem:
-        system = FleetSystem(name, self._entered, {**self._options, **options})
+        number = len(self.systems)  # No two programs draw the same random numbers.
+        system = FleetSystem(name, self._entered, {**self._options, "seed": 1000 * self.seed + number, **options})
         system.join(self.expected)
         self.systems.append(system)
         return system
@@ -66,6 +67,9 @@ class GuardedFleet(SimFleet):
     def end(self, program: SimProgram) -> None:
         """Have nothing of a program run any more, from this step on; what it has sent arrives."""
         program.servers.cut(log=False)
+        for system in self.systems:
+            if system in program.systems:
+                system.was_killed()
         program.halt(self._loop)
         if inside.get() is None:
             program.bury()

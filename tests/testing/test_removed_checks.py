@@ -304,12 +304,12 @@ CHECKS = {
         FLEET,
         "test_nothing_of_a_killed_program",
     ),
-    "what goes wrong in a program is told": Check(
+    "the systems of all programs are known": Check(
         "testing/fleet/guarded_fleet.py",
         "        self.systems.append(system)\n",
         "",
         FLEET,
-        "test_what_goes_wrong_in_a_program",
+        "test_what_was_asked_is_done_once",
     ),
     "programs share what is expected of them": Check(
         "testing/fleet/guarded_fleet.py",
@@ -358,7 +358,7 @@ CHECKS = {
         "        if self._is_ending:  # By the `finally` of what was killed: nobody runs it.\n",
         "        if False:\n",
         FLEET,
-        "test_what_was_asked_is_done_once",
+        "test_who_stands_by_leaves",
     ),
     "a set of refs has one order": Check(
         "actors/kernel/ref.py",

@@ -68,7 +68,7 @@ async def hold(servers: SimServers, held: dict[str, float], name: str, *, times:
 
 
 async def two_hold_one_lock(fleet: GuardedFleet, faults: Faults) -> None:
-    async with faults.on(fleet, at="request", split=0.1, seconds=(5.0, 30.0), times=1):
+    async with faults.on(fleet, at="post", split=0.05, seconds=(10.0, 30.0), times=1):
         for _ in range(2):
             fleet.start(give_locks)
         held: dict[str, float] = {}
