@@ -9,7 +9,7 @@ from __future__ import annotations
 import random
 from collections.abc import Callable
 from types import TracebackType
-from typing import Any, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 from ..actors.errors import HoldfastError, SpecError
 from ..actors.kernel.ref import ActorRef
@@ -17,7 +17,10 @@ from ..system.system import ActorSystem
 from .latencies import Latency, row_of
 from .schedules.choices import DELAY, FAULT, Choices
 
-Kind = Literal["crash", "hang", "delay", "drop", "duplicate", "reorder", "corrupt", "fail"]
+if TYPE_CHECKING:
+    from .fleet.sim_fleet import SimFleet, SimProgram
+
+Kind = Literal["crash", "hang", "delay", "drop", "duplicate", "reorder", "corrupt", "fail", "cut", "split"]
 KINDS: tuple[str, ...] = get_args(Kind)
 
 
@@ -93,6 +96,18 @@ POINTS: dict[str, Point] = {
             "a system's next process for an actor",
             ("fail", "crash", "delay"),
             "the start fails and is tried again within the supervisor's intensity",
+        ),
+        Point(
+            "post",
+            "what a program of a simulated fleet sends another program, or a client",
+            ("crash", "cut", "split", "drop", "delay", "duplicate"),
+            "crash, cut, split: another program leads; an ask to a recorded actor has one outcome",
+        ),
+        Point(
+            "request",
+            "what such a program asks of the servers of its system: for the log, the lease and large values",
+            ("crash", "cut", "split", "drop"),
+            "what was acknowledged stands in the log, and whoever leads next has it",
         ),
     )
 }
@@ -178,6 +193,16 @@ class Strikes:
             level = self._faults.choices.draw(DELAY, count, level)
         return self._row[level]
 
+    def tell(self, what: str) -> None:
+        """Say more of what the last fault has hit."""
+        told = self.struck[-1]._replace(what=what)
+        self.struck[-1] = self._faults.strikes[-1] = told
+
+    def is_hit(self) -> bool:
+        """Draw whether one more is hit by a fault that strikes several: half of them are."""
+        drawn = self.draw.random() < 0.5
+        return drawn if self._faults.choices is None else bool(self._faults.choices.draw(FAULT, 2, int(drawn)))
+
     def crash(self) -> InjectedCrash:
         """Return the exception of a crash that strikes now."""
         return InjectedCrash(self.at, self.chances, self.seed)
@@ -229,7 +254,7 @@ class Faults:
 
     def on(
         self,
-        target: ActorRef[Any] | ActorSystem,
+        target: ActorRef[Any] | ActorSystem | SimFleet | SimProgram,
         *,
         at: str,
         seconds: Latency = 1.0,
@@ -241,16 +266,17 @@ class Faults:
         """Faults at one point, from now to the end of the context: `async with faults.on(ref, at="admit", drop=0.1):`.
 
         Args:
-            target: the actor; for "process start" the system.
+            target: the actor; for "process start" the system; for "post" and "request" a program of a simulated fleet,
+                or the fleet, for all of its programs, also those that are started later.
             at: a name in POINTS.
-            seconds: how long a delay is, on the loop's clock, as a latency of `simulate` is said. What is reordered
-                comes after the next message, or so much later if there is none.
+            seconds: how long a delay is, on the loop's clock, or how long a program stays cut off, as a latency of
+                `simulate` is said. What is reordered comes after the next message, or so much later if there is none.
             after: this many chances are let pass first.
             times: at most so many strikes; None: no limit.
             replays: at "turn begin" and "turn end": the turns of a replay are chances, too. Left out, only turns that
                 no life has ended before are.
-            odds: by kind of fault (crash, hang, delay, drop, duplicate, reorder, corrupt, fail), the probability with
-                which it strikes at each chance; together at most 1.
+            odds: by kind of fault (crash, hang, delay, drop, duplicate, reorder, corrupt, fail, cut, split), the
+                probability with which it strikes at each chance; together at most 1.
 
         Raises:
             SpecError: there is no such point, the fault cannot strike there, or the target has no such point.
@@ -276,8 +302,10 @@ class Faults:
         return f"<Faults seed={self.seed}, {len(self.strikes)} struck>"
 
 
-def _path(target: ActorRef[Any] | ActorSystem) -> str:
-    return target.path if isinstance(target, ActorRef) else f"/{target.name}"
+def _path(target: ActorRef[Any] | ActorSystem | SimFleet | SimProgram) -> str:
+    if isinstance(target, ActorRef):
+        return target.path
+    return f"/{target.name}" if isinstance(target, ActorSystem) else target.name
 
 
 def _checked(point: Point, odds: dict[str, float]) -> dict[Kind, float]:

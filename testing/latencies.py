@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias, get_args
 from ..actors.errors import SpecError
 from ..actors.kernel.envelope import ReplyHandle
 from .library_code import is_module_of_library
-from .schedules.choices import DELAY, LEVELS
+from .schedules.choices import LATENCY, LEVELS
 
 if TYPE_CHECKING:
     from .schedules.choices import Choices
@@ -216,7 +216,7 @@ class DrawnSeconds:
         row = self._row
         if len(row) == 1:
             return row[0]
-        return row[self._choices.draw(DELAY, len(row), int(self._draw() * len(row)))]
+        return row[self._choices.draw(LATENCY, len(row), int(self._draw() * len(row)))]
 
 
 Said: TypeAlias = "Latency | Mapping[What, Latency]"

@@ -20,28 +20,26 @@ import sys
 import tempfile
 import traceback
 import warnings
-from collections.abc import Callable, Coroutine, Iterable
+from collections.abc import Callable, Collection, Coroutine, Iterable
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final
 from unittest import SkipTest
 
-from ..actors.errors import AskFailed, HoldfastError, SpecError
-from ..actors.kernel.cell import GONE
+from ..actors.errors import HoldfastError, SpecError
 from ..actors.kernel.envelope import Ask
-from ..actors.kernel.mailbox import admit_gone
 from ..actors.kernel.node import Node
 from ..actors.kernel.ref import ActorRef, current
-from .barrier import waiter_of
+from ..actors.process import worker_node
 from .charts.causes import leading
 from .charts.chart_html import as_html as chart_as_html
 from .charts.chart_text import as_text as chart_as_text
 from .charts.recorder import Recorder
 from .clock import TICKS
 from .faults import Faults
+from .fleet.guarded_fleet import GuardedFleet
 from .guard.leaks import Leaks
 from .guard.loop_leaks import LoopLeaks
-from .guard.loop_methods import LoopMethods
 from .guarded import GuardedSystem, UnexpectedEnd
 from .latencies import Latencies, Latency, LateReplies, Said, What, said_latencies
 from .library_code import is_file_of_library
@@ -73,7 +71,7 @@ from .schedules.hash_seeds import (
     with_hash_seed,
 )
 from .schedules.places import Root, inside
-from .schedules.processes import SimulatedWorkers
+from .schedules.processes import no_limits
 from .schedules.shrinking import Failed, shrink
 from .schedules.strategies import DEPTH, mixed
 from .schedules.strategies import strategy as strategy_of
@@ -111,7 +109,8 @@ class Simulation:
 
     Attributes:
         seed: what decides.
-        trace: (address, what was handled) of each turn, in the order in which they began.
+        trace: (address, what was handled) of each turn, in the order in which they began. Before an address in a fleet
+            stands the name of the program: `program 1:/bank/ledger`.
         choices: what was chosen.
         faults: those of the seed.
         disk: the simulated store, which outlives the root; None: there is none.
@@ -127,6 +126,8 @@ class Simulation:
         self._store: object = None
         self._roots: list[Root] = []  # each after the first has succeeded one that was killed
         self._life = contextlib.AsyncExitStack()  # of the system that lives
+        self._fleet_life = contextlib.AsyncExitStack()
+        self._fleet: GuardedFleet | None = None
         self._make: Callable[[], GuardedSystem] = GuardedSystem
         self._test: asyncio.Task[Any] | None = None
         self._draw = random.Random(f"moments {choices.seed}")
@@ -151,12 +152,32 @@ class Simulation:
         """List what the run has used that no seed decides."""
         return () if self.world is None else tuple(self.world.escaped)
 
+    @property
+    def system(self) -> GuardedSystem:
+        """The system that the test has."""
+        return self._roots[-1].system
+
+    @property
+    def fleet(self) -> GuardedFleet:
+        """The fleet that the test has."""
+        assert self._fleet is not None
+        return self._fleet
+
     async def begin(
-        self, options: dict[str, Any], recorder: Recorder | None = None, *, looks: bool = True, notes: bool = False
-    ) -> GuardedSystem:
-        """Start the system; from here on the seed decides."""
+        self,
+        options: dict[str, Any],
+        recorder: Recorder | None = None,
+        *,
+        looks: bool = True,
+        notes: bool = False,
+        own: Collection[str] = ("system",),
+    ) -> None:
+        """Start what the test has, of `system` and `fleet`, or a system if it has neither; then the seed decides."""
         loop = asyncio.get_running_loop()
         assert isinstance(loop, ControlledLoop)
+        has_fleet = "fleet" in own
+        if has_fleet and "system" not in own and options.get("store") is not None:
+            raise SpecError("simulate", "store= is of the system of the test; that of a fleet are its own servers")
         self._store = options.get("store")  # The marker of the test may name it, too.
         if self._store == PATH:
             self.disk = SimulatedDisk(loop.hold_up)
@@ -172,12 +193,15 @@ class Simulation:
         loop.latencies = self._latencies
         if "replies" in self._latencies:
             loop.late_replies = LateReplies(loop, self._latencies.of("replies"))
+        self._swaps.put(worker_node, "_apply", no_limits)
 
-        def watch(node: Node) -> None:
+        def watch(node: Node, name: str) -> None:
             if recorder is not None:
+                recorder.call(node, name)
                 self._ends.append(watch_turns(node, recorder))
 
-        root = await self._start()
+        root = None if has_fleet and "system" not in own else await self._start()
+        node = None if root is None else root.system._node
         if recorder is not None:
             self._ends.append(recorder.listen())
         if notes:
@@ -185,8 +209,17 @@ class Simulation:
             self._swaps.put(Ask, "answer", values.answering(Ask.answer))
         if loop.late_replies is not None:
             self._swaps.put(Ask, "answer", loop.late_replies.delaying(Ask.answer))
-        self._control = Control(self.choices, self._log, root.node, loop, on_node=watch)
-        return root.system
+        self._control = Control(self.choices, self._log, node, loop, on_node=watch)
+        if has_fleet:
+            fleet = GuardedFleet(self.choices, loop, options, self._look_at)
+            self._fleet = await self._fleet_life.enter_async_context(fleet)
+
+    def _look_at(self, system: GuardedSystem) -> None:
+        """Look at the messages of a system, or not."""
+        if not self._looks:
+            system.look_away()
+        elif self.world is not None:
+            system.read_along(self.world.look_for_addresses)
 
     async def _start(self) -> Root:
         """Start the next system, all of whose callbacks are marked as its root's."""
@@ -201,12 +234,9 @@ class Simulation:
             raise
         finally:
             inside.reset(mark)
-        root.node, root.is_up = root.system._node, True
+        root.is_up = True
         root.system._body = self._test
-        if not self._looks:
-            root.system.look_away()
-        elif self.world is not None:
-            root.system.read_along(self.world.look_for_addresses)
+        self._look_at(root.system)
         return root
 
     def told_of_its_end(self) -> None:
@@ -216,21 +246,28 @@ class Simulation:
             loop.end_by(None)
 
     async def end(self, kind: Any = None, error: Any = None, trace: Any = None) -> None:
-        """End the system that lives."""
-        await self._life.__aexit__(kind, error, trace)
+        """End the fleet, and the system that lives."""
+        try:
+            await self._fleet_life.__aexit__(kind, error, trace)
+        finally:
+            await self._life.__aexit__(kind, error, trace)
 
     def problems(self) -> list[str]:
         """List what happened and was not expected, as texts."""
-        return [problem for root in self._roots for problem in root.system.problems()]
+        return [problem for system in self._systems() for problem in system.problems()]
 
     def asks(self) -> dict[asyncio.Future[Any], tuple[str, object]]:
         """List what was asked in the run, and of whom."""
-        return {future: asked for root in self._roots for future, asked in root.system.asks.items()}
+        return {future: asked for system in self._systems() for future, asked in system.asks.items()}
 
     @property
     def are_exceptions_expected(self) -> bool:
         """Say whether exceptions may go unseen."""
-        return any(root.system.are_exceptions_expected for root in self._roots)
+        return any(system.are_exceptions_expected for system in self._systems())
+
+    def _systems(self) -> list[GuardedSystem]:
+        """All that there have been."""
+        return [*(root.system for root in self._roots), *(() if self._fleet is None else self._fleet.systems)]
 
     async def moment(self, turns: int = 100) -> None:
         """Wait for a drawn number of turns of actors, and no longer than until nothing else can happen."""
@@ -267,6 +304,8 @@ class Simulation:
             raise NoRootToKill(f"its store is {self._store!r}, which the killed root would still hold: take {PATH!r}")
         if current.get(None) is not None or inside.get() is not None:
             raise NoRootToKill("an actor cannot do it, only the test")
+        if not self._roots:
+            raise NoRootToKill("the test has no system of its own: kill a program of its fleet (fleet.kill)")
         before = self._roots[-1]
         if not before.is_up:
             raise NoRootToKill("it was killed, and is being started again")
@@ -277,8 +316,6 @@ class Simulation:
             self.disk.cut_power(self.choices)
         root = await self._start()
         root.system.succeed(before.system)
-        assert self._control is not None
-        self._control.add(root.node)
         return root.system
 
     def kill_process(self, ref: ActorRef[Any]) -> None:
@@ -287,7 +324,10 @@ class Simulation:
         Raises:
             SpecError: it has none now.
         """
-        worker = self._roots[-1].system._workers.of(ref._cell)
+        node = ref._cell.node
+        systems = [*(() if self._fleet is None else self._fleet.systems), *(root.system for root in self._roots[-1:])]
+        found = next((system for system in systems if system._running is node), None)
+        worker = None if found is None else found._workers.of(ref._cell)
         if worker is None:
             raise SpecError(ref.path, "it has no process of its own")
         worker.forked.kill()
@@ -327,15 +367,22 @@ class RealRun(Simulation):
         """The world stays as it is."""
 
     async def begin(
-        self, options: dict[str, Any], recorder: Recorder | None = None, *, looks: bool = True, notes: bool = False
-    ) -> GuardedSystem:
+        self,
+        options: dict[str, Any],
+        recorder: Recorder | None = None,
+        *,
+        looks: bool = True,
+        notes: bool = False,
+        own: Collection[str] = ("system",),
+    ) -> None:
+        if "fleet" in own:
+            raise SkipTest("a fleet of a test is always simulated: without --holdfast-real")
         if options.get("store") == PATH:
             folder = self._surroundings.enter_context(tempfile.TemporaryDirectory(prefix="holdfast-"))
             options["store"] = f"sqlite:{Path(folder, 'app.db')}"
         system = await self._life.enter_async_context(GuardedSystem(**options))
         self._roots.append(Root(system))
         self._ends.append(watch_turns(system._node, Tracer(self.trace)))
-        return system
 
     async def moment(self, turns: int = 100) -> None:
         """Wait for a drawn number of ticks of the loop."""
@@ -349,44 +396,11 @@ class RealRun(Simulation):
 
 
 def _kill(root: Root) -> None:
-    """Nothing of a root, whose system may only have begun, runs any more; whoever waits for it hears of that."""
-    system, loop = root.system, asyncio.get_running_loop()
-    node = system._node
-    if node is None:
-        return
+    """SIGKILL for the program of a root, whose system may only have begun."""
+    loop = asyncio.get_running_loop()
     assert isinstance(loop, ControlledLoop)
-    root.node, system._body = node, None
-    pool = vars(system).get("_workers")  # None: it did not come so far.
-    if isinstance(pool, SimulatedWorkers):
-        pool.end()
-    LoopMethods.of(type(loop)).actors_killed(loop, node)  # First: what is dropped is collected at once.
-    loop.drop(root)
-    node.threads.close()
-    cells = [] if node.root is None else [node.root]
-    for cell in cells:  # It grows meanwhile.
-        cells += (cell.children or {}).values()
-        cell.state, cell.admit = GONE, admit_gone
-    for ask in node.deadlines.close():
-        if ask.sender is None:
-            ask.fail(AskFailed(ask.to.path, "the root was killed"))
-            if isinstance(ask.future, asyncio.Future):
-                ask.future.exception()  # A client that waits no more need not see it.
-    for task in asyncio.all_tasks():
-        waiter = waiter_of(task)
-        if waiter is not None and not waiter.done() and _is_called_by(task, system, node):
-            waiter.set_exception(AskFailed(f"/{node.name}", "the root was killed"))
-    system._running = system._root = None  # It is not running.
-
-
-def _is_called_by(task: asyncio.Task[Any], system: GuardedSystem, node: Node) -> bool:
-    """Whether a task waits within a call of a system or of a ref to one of its actors, such as `send`."""
-    coro: Any = task.get_coro()
-    while inspect.iscoroutine(coro):
-        called = coro.cr_frame.f_locals.get("self") if coro.cr_frame is not None else None
-        if called is system or (isinstance(called, ActorRef) and called._cell.node is node):
-            return True
-        coro = coro.cr_await
-    return False
+    root.halt(loop)
+    root.bury()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -445,7 +459,9 @@ class SimulationSettings:
         if not inspect.iscoroutinefunction(test):
             raise TypeError(f"@simulate takes an `async def` test, not {test!r}")
         wanted = inspect.signature(test).parameters
-        own = {name for name in ("system", "faults", "simulation") if name in wanted}
+        own = {name for name in ("system", "fleet", "faults", "simulation") if name in wanted}
+        if "fleet" in own and self.strategy == "exhaustive":
+            raise SpecError("simulate", "strategy='exhaustive' is for actors of one system, and the test has a fleet")
         signature = inspect.Signature([parameter for name, parameter in wanted.items() if name not in own])
 
         @functools.wraps(test)
@@ -490,9 +506,10 @@ def simulate(
 ) -> Any:
     """Run an async test under many schedules, each on a virtual clock with a system of its own.
 
-    The test takes `system` (a running GuardedSystem) and, if it names them, `faults` (the seed's `Faults`) and
-    `simulation`. Whatever else it takes are fixtures; they are made once, for all seeds, and must not be async. What
-    the marker `holdfast` says holds for each seed. `@given` may stand above: each example runs under all seeds.
+    The test takes `system` (a running GuardedSystem), or `fleet` (a GuardedFleet: programs on simulated servers), or
+    both, and, if it names them, `faults` (the seed's `Faults`) and `simulation`. Whatever else it takes are fixtures;
+    they are made once, for all seeds, and must not be async. What the marker `holdfast` says holds for each seed.
+    `@given` may stand above: each example runs under all seeds.
 
     A test is run more often than there are seeds: some runs are made twice, and a failing one is repeated while it is
     shrunk. What it leaves in its surroundings must not change the next run.
@@ -939,10 +956,15 @@ async def _run(
     simulation.enter(asyncio.get_running_loop(), names_of(test))
     try:
         try:
-            system = await simulation.begin(options, recorder, looks=looks, notes=notes)
-            wanted.tell(system)
+            await simulation.begin(options, recorder, looks=looks, notes=notes, own=own)
+            given: dict[str, Any] = {"faults": faults, "simulation": simulation}
+            if "fleet" in own:
+                given["fleet"] = simulation.fleet
+                wanted.tell(simulation.fleet.expected)
+            if "system" in own or "fleet" not in own:
+                given["system"] = simulation.system
+                wanted.tell(simulation.system)
             try:
-                given = {"system": system, "faults": faults, "simulation": simulation}
                 try:
                     await test(**{name: given[name] for name in own})
                     unseen = leaks.unseen(simulation.asks())

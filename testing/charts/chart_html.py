@@ -48,10 +48,10 @@ def _drawn(rows: Sequence[ChartRow]) -> str:
         parts.append(f"<title>{html.escape(name)}</title></text>")
         parts.append(f'<line class="life" x1="{x}" y1="28" x2="{x}" y2="{height - 10}"/>')
     for number, row in enumerate(rows):
-        y, x = 48 + 24 * number, place[row.path]
+        y, x = 48 + 24 * number, place[row.name]
         parts.append(f'<text class="time" x="4" y="{y + 4}">{row.at:.3f}</text>')
-        if row.sender and row.sender != row.path:
-            start = place[row.sender]
+        if row.source and row.source != row.name:
+            start = place[row.source]
             end = x + (-8 if start < x else 8)
             parts.append(f'<line class="sent" x1="{start}" y1="{y}" x2="{end}" y2="{y}"/>')
         kind = "crash" if row.crashed else "turn"

@@ -11,22 +11,23 @@ SHOWN: Final = 40
 """Turns that the text shows, the last ones."""
 WIDEST: Final = 6
 """Columns of the text; where more actors take part, each row names who acts instead."""
-COLUMN: Final = 16
+COLUMN: Final = 20
 
 
 def columns(rows: Sequence[ChartRow]) -> list[str]:
     """Who takes part, in order of appearance."""
     found: dict[str, None] = {}
     for row in rows:
-        if row.sender:
-            found[row.sender] = None
-        found[row.path] = None
+        if row.source:
+            found[row.source] = None
+        found[row.name] = None
     return list(found)
 
 
 def short(path: str) -> str:
-    """The end of an address."""
-    return path.rsplit("/", 1)[-1] or path
+    """The end of an address, behind the program that it is in, if that has a name."""
+    program, colon, address = path.rpartition(":")
+    return f"{program}{colon}{address.rsplit('/', 1)[-1] or address}"
 
 
 def heading(led: Sequence[ChartRow], rows: Sequence[ChartRow]) -> str:
@@ -35,12 +36,12 @@ def heading(led: Sequence[ChartRow], rows: Sequence[ChartRow]) -> str:
     last = f"the last {SHOWN} of the {count}" if len(led) > SHOWN else f"the {count}"
     chosen = {*map(id, led)}
     others = [row for row in rows if id(row) not in chosen and not row.is_library]
-    actors = {row.path for row in others} - {row.path for row in led}
+    actors = {row.name for row in others} - {row.name for row in led}
     if not others:
         return f"{last} of the run:" if led else ""
     turns = "1 turn" if len(others) == 1 else f"{len(others)} turns"
     of = f", of {len(actors)} other actor{'' if len(actors) == 1 else 's'} and these" if actors else ""
-    if actors and all(row.path in actors for row in others):
+    if actors and all(row.name in actors for row in others):
         of = f" of {len(actors)} other actor{'' if len(actors) == 1 else 's'}"
     return f"{last} that lead{'s' if len(led) == 1 else ''} to it ({turns}{of} left out):"
 
@@ -59,17 +60,17 @@ def as_text(led: Sequence[ChartRow], rows: Sequence[ChartRow]) -> str:
     lines = [heading(led, rows)]
     if len(names) > WIDEST:
         for row in shown:
-            source = f"{row.sender} -> " if row.sender else ""
-            lines.append(f"  {row.at:>9.3f}  {source}{row.path}: {row.what}{_change(row)}")
+            source = f"{row.source} -> " if row.source else ""
+            lines.append(f"  {row.at:>9.3f}  {source}{row.name}: {row.what}{_change(row)}")
         return "\n".join(lines)
     width = min(COLUMN, max(len(short(name)) for name in names) + 3)
     lines.append("  " + " " * 11 + "".join(short(name)[: width - 1].ljust(width) for name in names))
     for row in shown:
         cells = ["|".ljust(width)] * len(names)
-        to = names.index(row.path)
+        to = names.index(row.name)
         text = list("".join(cells))
-        if row.sender and row.sender != row.path:
-            start = names.index(row.sender)
+        if row.source and row.source != row.name:
+            start = names.index(row.source)
             low, high = sorted((start, to))
             text[low * width + 1 : high * width] = "-" * ((high - low) * width - 1)
             text[start * width] = "+"

@@ -20,6 +20,7 @@ from ...actors.kernel.envelope import Ask, Item, ReplyHandle
 from ...actors.kernel.lifecycle import FirstTurn
 from ...actors.kernel.loop import TurnRemains
 from ...actors.kernel.message import Message, message_of
+from ...actors.kernel.node import Node
 from ...actors.kernel.ref import ActorRef, current
 from ...actors.kernel.timers import Tick
 from ...checkpoint.life.recorded_context import RecordedContext
@@ -65,6 +66,8 @@ class ChartRow:
         is_library: whether it is the library's own, and ends no life of a user's actor.
         is_probe: whether it is that of a probe, which tells the test.
         causes: what it follows from.
+        place: what its program is called, before the address; "": it has no name.
+        sender_place: the same of the sender.
     """
 
     at: float
@@ -76,6 +79,18 @@ class ChartRow:
     is_library: bool = False
     is_probe: bool = False
     causes: list[Cause] = dataclasses.field(default_factory=list)
+    place: str = ""
+    sender_place: str = ""
+
+    @property
+    def name(self) -> str:
+        """Whose turn it is, with the program."""
+        return self.place + self.path
+
+    @property
+    def source(self) -> str:
+        """Who has sent what it handles, with the program; "" if nobody in the system has."""
+        return self.sender_place + self.sender if self.sender else ""
 
 
 @dataclasses.dataclass(slots=True)
@@ -145,6 +160,18 @@ class Recorder(TurnWatcher):
         self._open: dict[Cell, OpenTurn] = {}
         self._ways: dict[Way, deque[Sent]] = {}
         self._newest: dict[Way, Sent] = {}
+        self._places: dict[object, str] = {}  # what is written before the addresses of a node
+
+    def call(self, node: Node, name: str) -> None:
+        """The program of a node has this name, or none."""
+        if name:
+            self._places[node] = f"{name}:"
+
+    def _place_of(self, sender: Cell | None, place: str) -> str:
+        """Where the sender of a message is that is handled in a place: there, or where its address had a turn last."""
+        if sender is None or sender.path.split("/", 2)[1:2] == [sender.node.name]:
+            return place
+        return self.rows[self.last[sender.path]].place if sender.path in self.last else ""
 
     # -- what is sent and answered ----------------------------------------------------------------------------------
 
@@ -255,7 +282,9 @@ class Recorder(TurnWatcher):
         what, sender = _what(cell, item, message), item.sender if isinstance(item, Item) else None
         is_own = message is None or is_module_of_library(type(message).__module__)
         source, number = "" if sender is None else sender.path, len(self.rows)
-        row = ChartRow(cell.node.loop.time(), cell.path, source, what, is_library=is_own)
+        place = self._places.get(cell.node, "")
+        row = ChartRow(cell.node.loop.time(), cell.path, source, what, is_library=is_own, place=place)
+        row.sender_place = self._place_of(sender, place)
         self._moment += 1
         before = self.last.get(cell.path, -1)
         if before < 0:

@@ -133,7 +133,8 @@ class ActorMachine(RuleBasedStateMachine):
     async def _begin(self) -> None:
         wanted = running.get()
         self._leaks = LoopLeaks(wanted.leaks)
-        self.system = await self._simulation.begin(self._options, self._recorder)
+        await self._simulation.begin(self._options, self._recorder)
+        self.system = self._simulation.system
         wanted.tell(self.system)
 
     def set_up(self) -> None:

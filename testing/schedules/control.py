@@ -32,7 +32,7 @@ from .disk import simulated
 from .due import DueQueue, Option, TellingHandle
 from .livelock import Rounds
 from .numbered import NumberedFuture, NumberedTask
-from .places import SimulatedPlace, inside, is_dead, never, no_more
+from .places import SimulatedPlace, inside, is_dead, never, no_more, place_of
 from .reduction.stepped import Stepped
 from .reduction.telling import TellingFuture, TellingTask
 from .reduction.watch import Watch
@@ -94,6 +94,7 @@ class ControlledLoop(VirtualClockLoop):
         self._sent: deque[asyncio.Handle] = deque()  # by threads
         self._work: dict[asyncio.Future[Any], int] = {}  # of anyio's threads, by when it was given
         self._resting: list[asyncio.Future[None]] = []
+        self._is_ending = False
         self._dead: list[Any] = []  # tasks: kept, since what is collected is closed, which runs its code
         self.latencies = Latencies(Choices(0), {})  # none
         self.late_replies: LateReplies | None = None
@@ -206,6 +207,9 @@ class ControlledLoop(VirtualClockLoop):
     def create_task(self, coro: Any, **options: Any) -> asyncio.Task[Any]:
         """As every loop; the hash of the task is its number."""
         task: asyncio.Task[Any]
+        if self._is_ending:  # By the `finally` of what was killed: nobody runs it.
+            _close(coro)
+            raise RuntimeError("Event loop is closed")
         if self.get_task_factory() is None:
             if self.is_closed():
                 raise RuntimeError("Event loop is closed")
@@ -220,6 +224,8 @@ class ControlledLoop(VirtualClockLoop):
         place = inside.get() if context is None else context.get(inside)
         if place is not None:
             place.tasks.add(task)
+            if place.is_dead:  # In the step in which it has died.
+                self._bury(task)
         return task
 
     def run_in_executor(self, executor: Any, func: Callable[[*Ts], T], *args: *Ts) -> asyncio.Future[T]:
@@ -244,11 +250,6 @@ class ControlledLoop(VirtualClockLoop):
         """When each late reply arrives."""
         return [] if self.late_replies is None else self.late_replies.times()
 
-    def add(self, place: SimulatedPlace) -> None:
-        """A place begins to run in this loop."""
-        if self.control is not None:
-            self.control.add(place.node)
-
     def drop(self, place: SimulatedPlace) -> None:
         """Nothing of this place runs any more."""
         place.is_dead = self.due.has_dead = True
@@ -257,19 +258,25 @@ class ControlledLoop(VirtualClockLoop):
             if is_dead(handle):
                 _close_unbegun(handle)
                 handle.cancel()
-        node = place.node
-        tasks: list[Any] = [*place.tasks, *(runner.task for runner in node._runners)]
+        tasks: list[Any] = [*place.tasks]
+        for node in place.nodes:
+            tasks += (runner.task for runner in node._runners)
+            node.wake = never  # type: ignore[method-assign]
+            node.idle_again = no_more  # type: ignore[method-assign]
+            if self.control is not None:
+                self.control.drop(node)
         for task in tasks:
-            asyncio._unregister_task(task)  # Nobody waits for it, and it cleans nothing up.
-            task._log_destroy_pending = False
-        self._dead += tasks
-        node.wake = never  # type: ignore[method-assign]
-        node.idle_again = no_more  # type: ignore[method-assign]
-        if self.control is not None:
-            self.control.drop(node)
+            self._bury(task)
+
+    def _bury(self, task: Any) -> None:
+        """Nobody waits for a task, and it cleans nothing up."""
+        asyncio._unregister_task(task)
+        task._log_destroy_pending = False
+        self._dead.append(task)
 
     def close(self) -> None:
         """As every loop. What was left of killed processes is collected now: Python runs the `finally` of each then."""
+        self._is_ending = True
         dead, self._dead = self._dead, []
         for task in dead:
             _close(task.get_coro())
@@ -322,22 +329,24 @@ def _do(done: asyncio.Future[T], work: Callable[[], T]) -> None:
 class Control:
     """Has the choices of one run carried out, from here to `remove`.
 
+    The turns of every node of the loop are chosen, from when its actors have something to do for the first time.
+
     Args:
         choices: what decides.
         log: notes the turns.
-        node: of the root.
+        node: of the system that the test has; None: it has none.
         loop: whose steps are chosen.
-        on_node: called with each node whose turns are chosen.
+        on_node: called with each node whose turns are chosen, and what its place is called.
     """
 
     def __init__(
         self,
         choices: Choices,
         log: TurnLog,
-        node: Node,
+        node: Node | None,
         loop: ControlledLoop,
         *,
-        on_node: Callable[[Node], None] = lambda node: None,
+        on_node: Callable[[Node, str], None] = lambda node, name: None,
     ) -> None:
         self.choices = choices
         self.choose: Callable[[int, Keys], int] = choices.turn  # which of so many goes on
@@ -354,7 +363,7 @@ class Control:
         self._nodes: dict[object, DrawnCells] = {}
         self._drained: DrawnCells | None = None  # where a turn was begun, after which nothing has been chosen yet
         self.watch: Watch | None = None
-        if isinstance(choices, Stepped):
+        if isinstance(choices, Stepped) and node is not None:
             self.watch = loop.due.watch = choices.watch = Watch(choices, node)
             self._due.is_told = True
         self._swaps = Swaps()
@@ -363,16 +372,26 @@ class Control:
         self._swaps.put(run_loop, "clock", self._clock)
         for name in ("MOST", "STRIDE"):
             self._swaps.put(run_loop, name, 1)
-        self.add(node)
+        if node is not None:
+            self.meet(node)
         loop.control = loop.due.chooser = self
 
-    def add(self, node: Node) -> None:
-        """The turns of this node are chosen, too: the root's, or that of a process."""
+    def meet(self, node: Node) -> None:
+        """The turns of this node are chosen, too, from now on."""
+        if node in self._nodes:
+            return
+        place = place_of(node)
+        name = "" if place is None else place.name
+        if place is not None and node not in place.nodes:
+            place.nodes.append(node)
+        self._log.call(node, name)
         cells = self._nodes[node] = DrawnCells(node.ready, self)
         self._swaps.put(node, "ready", cells)
-        for name in ("most", "stride"):
-            self._swaps.put(node, name, 1)  # One turn, and a look at the clock, which is where the next step is chosen.
-        self._on_node(node)
+        for limit in ("most", "stride"):
+            self._swaps.put(
+                node, limit, 1
+            )  # One turn, and a look at the clock, which is where the next step is chosen.
+        self._on_node(node, name)
 
     def drop(self, node: Node) -> None:
         """Nothing of this node has a turn any more."""

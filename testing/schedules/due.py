@@ -54,6 +54,10 @@ class Chooser(Protocol):
         """A callback was taken, and is called now."""
         ...
 
+    def meet(self, node: Node) -> None:
+        """The actors of a node have something to do: for the first time, perhaps."""
+        ...
+
 
 class DueQueue:
     """Stands in for the queue of an asyncio loop: who takes the next callback gets the one that was chosen.
@@ -101,6 +105,8 @@ class DueQueue:
             self.watch.made(key, handle, has_place)
         if self.has_dead and is_dead(handle):
             handle.cancel()
+        elif type(owner) is Node and self.chooser is not None:
+            self.chooser.meet(owner)
 
     def popleft(self) -> asyncio.Handle:
         """Take the callback that is called next."""

@@ -36,8 +36,7 @@ from ...actors.process.worker_pool import Worker, Workers
 from ...checkpoint.life.recorded_context import RecordedContext
 from ...system.worker_main import WorkerComposition
 from ..latencies import DelayLine
-from ..swaps import Swaps
-from .places import SimulatedPlace, inside
+from .places import ProgramPlace, SimulatedPlace, inside
 
 if TYPE_CHECKING:
     from ...actors.kernel.node import Node
@@ -159,7 +158,7 @@ class SimulatedProcess(SimulatedPlace):
     """
 
     def __init__(self, pid: int, pool: SimulatedWorkers) -> None:
-        super().__init__()
+        super().__init__(pool.place_name)
         self.pid, self.pool = pid, pool
         self.page = bytearray(PAGE_BYTES)
         self.context = Context()
@@ -192,7 +191,7 @@ class SimulatedProcess(SimulatedPlace):
         guest = self.guest = worker_node.Guest(
             loop, memoryview(self.page).cast("Q"), WorkerComposition, None, SimulatedEffectProcess
         )
-        self.node = guest.node
+        self.nodes.append(guest.node)
         theirs = Connection(guest.on_frame, guest.on_lost, guest.on_batch)
         guest.join(theirs)
         theirs.takers = guest.takers
@@ -298,11 +297,13 @@ class SimulatedWorkers(Workers):
         super().__init__(node, "", [], on_frame, warm=0)
         self.loop = loop
         self.root_context = copy_context()
+        place = inside.get()
+        self.place_name = "" if place is None else place.name
+        if isinstance(place, ProgramPlace):
+            place.pools.append(self)
         self._pids = itertools.count(FIRST_PID)
         self._processes: list[SimulatedProcess] = []
         self._stub = SimulatedServer()
-        self._swaps = Swaps()
-        self._swaps.put(worker_node, "_apply", _no_limits)
         self.effects = EffectProcesses(node.codec, SimulatedEffectProcess)
 
     async def arrived(self) -> bool:
@@ -325,7 +326,6 @@ class SimulatedWorkers(Workers):
     def born(self, process: SimulatedProcess) -> None:
         """A process has its node."""
         self._processes.append(process)
-        self.loop.add(process)
 
     async def close(self) -> None:
         await super().close()
@@ -335,8 +335,7 @@ class SimulatedWorkers(Workers):
         """Every process dies."""
         for process in self._processes:
             process.die(signal.SIGKILL)
-        self._swaps.undo()
 
 
-def _no_limits(limits: dict[str, Any]) -> None:
+def no_limits(limits: dict[str, Any]) -> None:
     """They would be the limits of the test's own process."""

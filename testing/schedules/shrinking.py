@@ -1,9 +1,10 @@
 """Shrinking: the same failure with as few choices as possible that differ from what production would do.
 
-Faults go first, then turns, in halves, quarters, and singly, as long as the failure stays; what is left is all that it
-takes. Then each of these choices is made smaller, and comes earlier, if the failure stays. Of schedules of equally few
-choices the one with the fewest turns wins, then that of the fewest actors, then that of the smallest choices: latencies
-are as short as they may be. Source: delta debugging (Zeller and Hildebrandt, IEEE TSE 2002).
+Latencies go first, then faults, then turns: each kind as a whole, then in halves, quarters, and singly, as long as the
+failure stays; what is left is all that it takes. Then each of these choices is made smaller, and comes earlier, if the
+failure stays. Of schedules of equally few choices the one with the fewest turns wins, then that of the fewest actors,
+then that of the smallest choices: latencies are as short as they may be. Source: delta debugging (Zeller and
+Hildebrandt, IEEE TSE 2002).
 """
 
 from __future__ import annotations
@@ -12,14 +13,14 @@ import time
 from collections.abc import Callable
 from typing import NamedTuple
 
-from .choices import DELAY, FAULT, HOLD, LOSS, MOMENT, TURN, Taken
+from .choices import DELAY, FAULT, HOLD, LATENCY, LOSS, MOMENT, TURN, Taken
 
 SECONDS = 10.0
 """Real seconds that shrinking may take."""
 RUNS = 1000
 SMALLER = 100
 """Runs in which choices are made smaller, beside those in which they become fewer."""
-ORDER = (FAULT, LOSS, DELAY, MOMENT, TURN, HOLD)
+ORDER = (LATENCY, FAULT, LOSS, DELAY, MOMENT, TURN, HOLD)
 
 Item = tuple[str, int, int]
 now = time.perf_counter
@@ -82,6 +83,10 @@ class Shrinking:
         """Leave out choices, in halves, quarters, and singly."""
         if not self.best.items or self.is_better([]):
             return
+        for kind in ORDER:
+            others = [item for item in self.best.items if item[0] != kind]
+            if 0 < len(others) < len(self.best.items) and self.goes_on():
+                self.is_better(others)
         size = max(1, len(self.best.items) // 2)
         while self.best.items and self.goes_on():
             at, shorter = 0, False

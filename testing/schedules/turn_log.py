@@ -14,6 +14,7 @@ from ...actors.kernel.cell import NEXT_URGENT, Cell
 from ...actors.kernel.codec import Parcel, encode_special
 from ...actors.kernel.envelope import Ask, Item, ReplyHandle
 from ...actors.kernel.message import Message, message_of
+from ...actors.kernel.node import Node
 from ...checkpoint.life.recorded_inbox import Fed
 from ..library_code import is_module_of_library
 
@@ -142,7 +143,7 @@ class TurnLog:
     """Notes each turn in a trace.
 
     Args:
-        trace: (address, what was handled) of each turn.
+        trace: (address, what was handled) of each turn; before the address that of which program, if it has a name.
 
     Attributes:
         values: notes what is handled, too; None: nobody does.
@@ -152,12 +153,18 @@ class TurnLog:
         self.values: HandledValues | None = None
         self._trace = trace
         self._names: dict[type, str] = {}
+        self._places: dict[object, str] = {}  # what is written before the addresses of a node
         self._moments: list[tuple[int, asyncio.Future[None]]] = []  # after so many turns of the run
 
     @property
     def turns(self) -> int:
         """How many there have been."""
         return len(self._trace)
+
+    def call(self, node: Node, name: str) -> None:
+        """The place of a node has this name, or none."""
+        if name:
+            self._places[node] = f"{name}:"
 
     def note(self, cell: Cell) -> None:
         """A cell has the next turn."""
@@ -172,7 +179,8 @@ class TurnLog:
                 name = told(cell, item)
                 if isinstance(message, Message):
                     self._names[type(message)] = name
-            self._trace.append((cell.path, name))
+            place = self._places.get(cell.node)
+            self._trace.append((cell.path if place is None else place + cell.path, name))
             if self.values is not None:
                 self.values.turn(cell, item, name)
 

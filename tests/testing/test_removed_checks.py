@@ -17,6 +17,7 @@ LATENCIES = "tests/testing/schedules/test_latencies.py"
 CHARTS = "tests/testing/charts/test_charts.py"
 EXHAUSTIVE = "tests/testing/schedules/test_exhaustive.py"
 ESCAPES = "tests/testing/schedules/test_escapes.py"
+FLEET = "tests/testing/fleet/test_simulated_programs.py"
 
 CHECKS = {
     "a turn has time between two outcomes": Check(
@@ -354,6 +355,111 @@ CHECKS = {
         "        return self._real.__await__()\n",
         EXHAUSTIVE,
         "test_it_finds_whatever and an_outcome",
+    ),
+    "the turns of every node are chosen": Check(
+        "testing/schedules/due.py",
+        "            self.chooser.meet(owner)\n",
+        "            pass\n",
+        FLEET,
+        "test_every_system_of_a_test",
+    ),
+    "what is on its way between programs outlives its sender": Check(
+        "testing/fleet/post.py",
+        "to, data, back, context=self._nowhere)",
+        "to, data, back)",
+        FLEET,
+        "test_what_a_program_has_sent",
+    ),
+    "all who listen at a place hear": Check(
+        "testing/fleet/post.py",
+        "        for hearer in tuple(self._hearers.get(to, ())):\n",
+        "        for hearer in tuple(self._hearers.get(to, ()))[-1:]:\n",
+        FLEET,
+        "test_a_bug_that_a_split_shows",
+    ),
+    "two that are cut off from each other hear nothing": Check(
+        "testing/fleet/post.py",
+        "{sender, owner} == pair for pair in (*cuts, *self._cuts)",
+        "False for pair in cuts",
+        FLEET,
+        "test_two_that_are_cut_off",
+    ),
+    "latencies are choices of their own": Check(
+        "testing/schedules/choices.py",
+        "self._choices.draw(LATENCY, ",
+        "self._choices.draw(DELAY, ",
+        FLEET,
+        "test_a_bug_that_a_split_shows",
+    ),
+    "a killed program is halted": Check(
+        "testing/fleet/guarded_fleet.py",
+        "        program.halt(self._loop)\n",
+        "",
+        FLEET,
+        "test_nothing_of_a_killed_program",
+    ),
+    "who waits for a killed program hears of its end": Check(
+        "testing/fleet/guarded_fleet.py",
+        "            program.bury()\n",
+        "            pass\n",
+        FLEET,
+        "test_nothing_of_a_killed_program",
+    ),
+    "the systems of all programs are known": Check(
+        "testing/fleet/guarded_fleet.py",
+        "        self.systems.append(system)\n",
+        "",
+        FLEET,
+        "test_what_was_asked_is_done_once",
+    ),
+    "programs share what is expected of them": Check(
+        "testing/fleet/guarded_fleet.py",
+        "        system.join(self.expected)\n",
+        "",
+        FLEET,
+        "test_what_goes_wrong_in_a_program",
+    ),
+    "a loop's own clock is that of all its processes": Check(
+        "actors/kernel/node.py",
+        "loop.time if has_own else monotonic",
+        "monotonic",
+        FLEET,
+        "test_deadlines_are_on",
+    ),
+    "a fleet by hand is refused in a simulated test": Check(
+        "testing/fleet/sim_fleet.py",
+        "        if is_controlled(asyncio.get_running_loop()):\n",
+        "        if False:\n",
+        FLEET,
+        "test_what_does_not_fit",
+    ),
+    "a fleet is not searched exhaustively": Check(
+        "testing/simulation.py",
+        """        if "fleet" in own and self.strategy == "exhaustive":\n""",
+        "        if False:\n",
+        FLEET,
+        "test_what_does_not_fit",
+    ),
+    "a request that is struck is lost": Check(
+        "testing/fleet/sim_engine.py",
+        "        if link.is_struck():\n",
+        "        if False:\n",
+        "tests/testing/test_faults.py",
+        "test_request_faults",
+    ),
+    "the program of a turn is named": Check(
+        "testing/schedules/control.py",
+        "        self._log.call(node, name)\n",
+        "",
+        FLEET,
+        "test_the_order_of_turns",
+    ),
+    "what is killed starts no task in its last step": Check(
+        "testing/schedules/control.py",
+        "        if self._is_ending:  # By the `finally` of what was killed: nobody runs it.\n",
+        "        if False:\n",
+        FLEET,
+        "test_who_stands_by_leaves",
     ),
     "a set of refs has one order": Check(
         "actors/kernel/ref.py",

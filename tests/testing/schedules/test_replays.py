@@ -86,8 +86,27 @@ async def test_it(system):
 """
 
 
-def test_what_is_known_of_a_failure_is_kept_where_it_is_asked_for(pytester: pytest.Pytester) -> None:
-    result = run_suite(pytester, HEAD + FAILS, "--holdfast-record", "artefacts")
+FAILS_IN_A_FLEET = """
+from holdfast.testing import simulate
+
+async def main(program):
+    async with program.open() as system:
+        await system.start(hf.child("counter", hf.start(Counter)))
+        await asyncio.Event().wait()
+
+@simulate(seeds=3)
+async def test_it(fleet):
+    fleet.start(main)
+    async with hf.connect(fleet.servers(), timeout=60.0) as connection:
+        assert await connection.ref("/app/counter", Counter).ask(Add(1)) == 2
+"""
+
+
+@pytest.mark.parametrize(("tests", "address"), [(FAILS, "/app/$1"), (FAILS_IN_A_FLEET, "program 1:/app/counter")])
+def test_what_is_known_of_a_failure_is_kept_where_it_is_asked_for(
+    pytester: pytest.Pytester, tests: str, address: str
+) -> None:
+    result = run_suite(pytester, HEAD + tests, "--holdfast-record", "artefacts")
     assert result.ret == 1
     (folder,) = (pytester.path / "artefacts").iterdir()
     assert sorted(file.name for file in folder.iterdir()) == ["chart.html", "failure.txt", "schedule.txt"]
@@ -96,8 +115,8 @@ def test_what_is_known_of_a_failure_is_kept_where_it_is_asked_for(pytester: pyte
     assert told[0].endswith("::test_it")
     assert "AssertionError" in told[1]
     assert any(line.startswith("seed=0: repeat it with") for line in told)
-    assert told[-1].split("\t")[2:] == ["/app/$1", "Add(n=1)", "total: 0 -> 1"]
-    again = run_suite(pytester, HEAD + FAILS, "--holdfast-replay", str(folder / "schedule.txt"))
+    assert told[-1].split("\t")[2:] == [address, "Add(n=1)", "total: 0 -> 1"]
+    again = run_suite(pytester, HEAD + tests, "--holdfast-replay", str(folder / "schedule.txt"))
     assert again.ret == 1
     assert f'replay="{schedule}"' in str(again.stdout)
 
