@@ -298,7 +298,7 @@ class Simulation:
         return [] if self._log.values is None else self._log.values.handled
 
     def extent(self) -> tuple[int, int]:
-        """How many turns the test has had before it was over, and of how many actors."""
+        """Return how many turns the test has had before it was over, and of how many actors."""
         turns = self.trace[: self._over]
         return len(turns), len({path for path, _ in turns})
 
