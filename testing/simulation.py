@@ -33,8 +33,8 @@ from ..actors.kernel.ref import ActorRef, current
 from ..actors.process import worker_node
 from .charts.causes import leading
 from .charts.chart_html import as_html as chart_as_html
+from .charts.chart_recorder import Recorder
 from .charts.chart_text import as_text as chart_as_text
-from .charts.recorder import Recorder
 from .clock import TICKS
 from .faults import Faults
 from .fleet.guarded_fleet import GuardedFleet
@@ -72,7 +72,7 @@ from .schedules.hash_seeds import (
 )
 from .schedules.places import Root, inside
 from .schedules.processes import no_limits
-from .schedules.shrinking import Failed, shrink
+from .schedules.shrinking import FailedRun, shrink
 from .schedules.strategies import DEPTH, mixed
 from .schedules.strategies import strategy as strategy_of
 from .schedules.time_limits import TimeLimit, is_of_time_limit
@@ -338,7 +338,7 @@ class Simulation:
         return [] if self._log.values is None else self._log.values.handled
 
     def extent(self) -> tuple[int, int]:
-        """How many turns the test has had before it was over, and of how many actors."""
+        """Return how many turns the test has had before it was over, and of how many actors."""
         turns = self.trace[: self._over]
         return len(turns), len({path for path, _ in turns})
 
@@ -687,14 +687,14 @@ class ScheduleSearch:
         first: Simulation = failure.__simulation__  # type: ignore[attr-defined]
         seed, kind = first.seed, _kind(failure)
 
-        def fails(taken: Taken) -> Failed | None:
+        def fails(taken: Taken) -> FailedRun | None:
             try:
                 self._run(repeated(seed, taken))
             except BaseException as error:
                 if not _is_failure(error):
                     raise
                 again: Simulation = error.__simulation__  # type: ignore[attr-defined]
-                return Failed(again.choices.kept(), *again.extent()) if _kind(error) == kind else None
+                return FailedRun(again.choices.kept(), *again.extent()) if _kind(error) == kind else None
             return None
 
         taken = first.choices.kept()

@@ -18,7 +18,7 @@ from ...actors.kernel.actor import Actor
 from ...actors.kernel.ref import ActorRef
 from ..library_code import is_file_of_library
 from ..probes import Probe
-from .recorder import NEVER, ChartRow, Recorder, paths_in
+from .chart_recorder import NEVER, ChartRow, Recorder, paths_in
 
 WITHIN: Final = 100
 """Members of a container that are looked at."""

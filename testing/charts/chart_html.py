@@ -5,8 +5,8 @@ from __future__ import annotations
 import html
 from collections.abc import Sequence
 
+from .chart_recorder import ChartRow
 from .chart_text import columns, heading, short
-from .recorder import ChartRow
 
 STYLE = """body{font:14px system-ui,sans-serif;margin:2em}h1{font-size:18px}
 pre{background:#f4f4f4;padding:1em;overflow:auto}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from .recorder import ChartRow
+from .chart_recorder import ChartRow
 
 SHOWN: Final = 40
 """Turns that the text shows, the last ones."""

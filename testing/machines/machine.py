@@ -29,8 +29,8 @@ from ...actors.kernel.ref import DEFAULT_TIMEOUT, ActorRef
 from ...supervision.spec import ChildSpec
 from ..barrier import idle
 from ..charts.causes import leading
+from ..charts.chart_recorder import Recorder
 from ..charts.chart_text import as_text as chart_as_text
-from ..charts.recorder import Recorder
 from ..clock import advance
 from ..faults import Faults, Strikes
 from ..guard.loop_leaks import LoopLeaks

@@ -27,7 +27,7 @@ now = time.perf_counter
 """The real clock: that of a run is the seed's."""
 
 
-class Failed(NamedTuple):
+class FailedRun(NamedTuple):
     """A run that fails: the choices that it has really made, and the turns and the actors that it took."""
 
     taken: Taken
@@ -58,7 +58,7 @@ class Shrinking:
         seconds: how long to try, on the real clock.
     """
 
-    def __init__(self, taken: Taken, fails: Callable[[Taken], Failed | None], seconds: float) -> None:
+    def __init__(self, taken: Taken, fails: Callable[[Taken], FailedRun | None], seconds: float) -> None:
         self.best = Best(_items(taken), float("inf"), float("inf"))
         self._fails, self._end, self._left = fails, now() + seconds, RUNS
 
@@ -124,7 +124,7 @@ class Shrinking:
                 least = middle
 
 
-def shrink(taken: Taken, fails: Callable[[Taken], Failed | None], seconds: float = SECONDS) -> Taken:
+def shrink(taken: Taken, fails: Callable[[Taken], FailedRun | None], seconds: float = SECONDS) -> Taken:
     """The smallest schedule found that still fails; see `Shrinking`."""
     shrinking = Shrinking(taken, fails, seconds)
     shrinking.make_fewer()

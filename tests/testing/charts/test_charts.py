@@ -14,8 +14,8 @@ import holdfast as hf
 from holdfast.testing import GuardedSystem, advance, idle, probe, simulate
 from holdfast.testing.charts.causes import leading
 from holdfast.testing.charts.chart_html import as_html
+from holdfast.testing.charts.chart_recorder import Recorder
 from holdfast.testing.charts.chart_text import as_text, short
-from holdfast.testing.charts.recorder import Recorder
 from holdfast.testing.schedules.choices import Production
 from holdfast.testing.simulation import run_schedule
 from tests.testing.schedules.planted import (

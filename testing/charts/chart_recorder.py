@@ -38,7 +38,7 @@ NEVER: Final = 1 << 62
 """A moment after the end of the run."""
 
 
-class Cause(NamedTuple):
+class TurnCause(NamedTuple):
     """What a turn follows from: what another one had done up to a moment.
 
     Attributes:
@@ -78,7 +78,7 @@ class ChartRow:
     crashed: bool = False
     is_library: bool = False
     is_probe: bool = False
-    causes: list[Cause] = dataclasses.field(default_factory=list)
+    causes: list[TurnCause] = dataclasses.field(default_factory=list)
     place: str = ""
     sender_place: str = ""
 
@@ -155,7 +155,7 @@ class Recorder(TurnWatcher):
         self.refused: list[tuple[BaseException, str]] = []
         self.sent: list[Sent] = []
         self._moment = 0
-        self.orders: dict[str, list[Cause]] = {}
+        self.orders: dict[str, list[TurnCause]] = {}
         self._asked: dict[int, tuple[Ask, int, Sent | None]] = {}  # by their ids, with the turns that handle them
         self._open: dict[Cell, OpenTurn] = {}
         self._ways: dict[Way, deque[Sent]] = {}
@@ -225,7 +225,7 @@ class Recorder(TurnWatcher):
             row = self._row_here()
             if row >= 0:
                 self._moment += 1
-                self.orders.setdefault(ref.path, []).append(Cause(self._moment, row, self._moment))
+                self.orders.setdefault(ref.path, []).append(TurnCause(self._moment, row, self._moment))
             give_order(ref, order)
 
         return noted
@@ -273,7 +273,7 @@ class Recorder(TurnWatcher):
         if not to:
             self.heard.append((asked, row))
         elif (told_row := self.last.get(to, -1)) >= 0:
-            self.rows[told_row].causes.append(Cause(self._moment, row, self._moment))
+            self.rows[told_row].causes.append(TurnCause(self._moment, row, self._moment))
 
     # -- turns ------------------------------------------------------------------------------------------------------
 
@@ -290,11 +290,11 @@ class Recorder(TurnWatcher):
         if before < 0:
             before = self.last.get(cell.path.rpartition("/")[0], -1)  # Who has started it.
         if before >= 0:
-            row.causes.append(Cause(self._moment, before, self._moment))
+            row.causes.append(TurnCause(self._moment, before, self._moment))
         name = item.feed.name if isinstance(item, Fed) else type(message).__qualname__
         sent = None if message is None else self._taken(cell, item, source, _name(name))
         if sent is not None and sent.row >= 0:
-            row.causes.append(Cause(self._moment, sent.row, sent.moment))
+            row.causes.append(TurnCause(self._moment, sent.row, sent.moment))
         if message is None:
             row.causes += self.orders.get(cell.path, ())
         if isinstance(item, TurnRemains):
@@ -307,13 +307,13 @@ class Recorder(TurnWatcher):
         self.rows.append(row)
         return None
 
-    def _behind_error(self, error: BaseException | None) -> list[Cause]:
+    def _behind_error(self, error: BaseException | None) -> list[TurnCause]:
         """What the actors have done, or who has ordered them to stop, that an error names."""
-        found: list[Cause] = []
+        found: list[TurnCause] = []
         for path in paths_in(str(error)):
             found += self.orders.get(path, ())
             if path in self.last:
-                found.append(Cause(self._moment, self.last[path], self._moment))
+                found.append(TurnCause(self._moment, self.last[path], self._moment))
         return found
 
     def _taken(self, cell: Cell, item: Any, source: str, name: str) -> Sent | None:
