@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 ASYNCIO = asyncio.__file__.rpartition("/")[0]
 ORDERS = 0
 """In place of the id of a message: commands come in order."""
-ACTOR: Any = Cell.actor
+ACTOR: Any = vars(Cell.__base__)["actor"]
 GATHERED = "gather.<locals>._done_callback"
 WAKE_UPS = ("_set_result_unless_cancelled", "_release_waiter")
 """Timers of asyncio that end a wait, and do nothing else."""
@@ -182,6 +182,7 @@ class Watch:
     def callback(self, option: Option) -> None:
         """A callback is called."""
         key, handle, has_place = option
+        context: Any = handle._context  # type: ignore[attr-defined]  # no stub has it
         made = self._made.pop(id(handle), -1)
         owner: Any = key
         self._begin(self.name(key), {made} if made >= 0 else set())
@@ -189,11 +190,11 @@ class Watch:
             lane = lane_of(handle)
             self._lanes[lane].popleft()
             self._stepped.keep_place(lane, made)
-        place = handle._context.get(inside)
+        place = context.get(inside)
         if place is not None and type(place) is not Root:
             self._writes.add(EVERYTHING)
         elif isinstance(owner, asyncio.Task):
-            self._step_of(owner, handle._context)
+            self._step_of(owner, context)
         elif type(owner) is not Node:
             self._call(handle)
 
