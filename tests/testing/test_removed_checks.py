@@ -353,6 +353,13 @@ CHECKS = {
         EXHAUSTIVE,
         "test_it_finds_whatever and an_outcome",
     ),
+    "shrinking ends in time": Check(
+        "testing/machines/shrink_time.py",
+        '            self._swaps.put(engine, "MAX_SHRINKING_SECONDS", seconds)\n',
+        "",
+        "tests/testing/machines/test_machine.py",
+        "test_shrinking_ends",
+    ),
     "a set of refs has one order": Check(
         "actors/kernel/ref.py",
         "            found = self._hash = hash_of_address(self._cell.path)\n",

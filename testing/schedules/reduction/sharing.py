@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import enum
-import functools
 import types
 from collections import deque
-from collections.abc import Hashable, Iterator
+from collections.abc import Iterator
 from typing import Any, Final
 
 import msgspec
@@ -21,8 +20,7 @@ CODE: Final = (types.FunctionType, types.BuiltinFunctionType, types.ModuleType, 
 
 def shares_memory(start: Start[Any]) -> bool:
     """Whether an actor is given something that can be changed, or its code knows something of that kind by name."""
-    kind: Hashable = start.kind
-    return _knows_shared(kind) or not all(map(_is_fixed, (*start.args, *start.kwargs.values())))
+    return _knows_shared(start.kind) or not all(map(_is_fixed, (*start.args, *start.kwargs.values())))
 
 
 def _is_fixed(value: Any) -> bool:
@@ -36,8 +34,7 @@ def _is_fixed(value: Any) -> bool:
     return False
 
 
-@functools.cache
-def _knows_shared(kind: Any) -> bool:
+def _knows_shared(kind: type[Any]) -> bool:
     classes = kind.__mro__[: kind.__mro__.index(Actor)]
     return any(
         isinstance(value, types.FunctionType) and any(map(_is_shared, _known_to(value)))
