@@ -320,7 +320,7 @@ CHECKS = {
     ),
     "in which order outcomes are gathered changes nothing": Check(
         "testing/schedules/reduction/watch.py",
-        "        if _is_gathered(callback) and _has_succeeded(*handle._args):",
+        "        if _is_gathered(function) and _has_succeeded(*handle._args):",
         "        if False:",
         EXHAUSTIVE,
         "test_two_lost_updates",
