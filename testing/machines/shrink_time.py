@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, Final
 
 from hypothesis.internal.conjecture import engine
+from hypothesis.reporting import report
 
 from ..swaps import Swaps
 
@@ -17,7 +18,6 @@ class ShrinkTime:
 
     def __init__(self) -> None:
         self._swaps = Swaps()
-        self._report: Any = engine.report
         self._is_begun = self._is_over = False
 
     def begin(self, seconds: float) -> None:
@@ -37,4 +37,4 @@ class ShrinkTime:
         if isinstance(text, str) and text.startswith(CUT):
             self._is_over = True
         else:
-            self._report(text)
+            report(text)

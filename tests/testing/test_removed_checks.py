@@ -323,7 +323,7 @@ CHECKS = {
     ),
     "in which order outcomes are gathered changes nothing": Check(
         "testing/schedules/reduction/watch.py",
-        "        if _is_gathered(callback) and _has_succeeded(*handle._args):",
+        "        if _is_gathered(function) and _has_succeeded(*handle._args):",
         "        if False:",
         EXHAUSTIVE,
         "test_two_lost_updates",
@@ -461,6 +461,13 @@ CHECKS = {
         FLEET,
         "test_who_stands_by_leaves",
     ),
+    "shrinking ends in time": Check(
+        "testing/machines/shrink_time.py",
+        '            self._swaps.put(engine, "MAX_SHRINKING_SECONDS", seconds)\n',
+        "",
+        "tests/testing/machines/test_machine.py",
+        "test_shrinking_ends",
+    ),
     "a set of refs has one order": Check(
         "actors/kernel/ref.py",
         "            found = self._hash = hash_of_address(self._cell.path)\n",
@@ -470,7 +477,7 @@ CHECKS = {
     ),
     "a latency is drawn by the seed, and kept as a choice": Check(
         "testing/latencies.py",
-        "        return row[self._choices.draw(DELAY, len(row), int(self._draw() * len(row)))]\n",
+        "        return row[self._choices.draw(LATENCY, len(row), int(self._draw() * len(row)))]\n",
         "        return row[int(self._draw() * len(row))]\n",
         LATENCIES,
         "test_a_late_frame_is_found_repeated",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import enum
-import functools
 import types
 from collections import deque
 from collections.abc import Iterator
@@ -35,8 +34,7 @@ def _is_fixed(value: Any) -> bool:
     return False
 
 
-@functools.cache
-def _knows_shared(kind: type[Actor]) -> bool:
+def _knows_shared(kind: type[Any]) -> bool:
     classes = kind.__mro__[: kind.__mro__.index(Actor)]
     return any(
         isinstance(value, types.FunctionType) and any(map(_is_shared, _known_to(value)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Hashable
+from collections.abc import Callable, Hashable
 from contextvars import Context, copy_context
 from typing import Any, ClassVar, Protocol, TypeVar
 
@@ -36,15 +36,15 @@ class Telling:
     def token(self) -> Hashable:
         return self.kind, self.number
 
-    def cancel(self, msg: Any = None) -> bool:
+    def cancel(self, msg: Any = None) -> Any:
         self.listener.write(self.token)
         return self._real.cancel(msg)
 
-    def done(self) -> bool:
+    def done(self) -> Any:
         self.listener.read(self.token)
         return self._real.done()
 
-    def cancelled(self) -> bool:
+    def cancelled(self) -> Any:
         self.listener.read(self.token)
         return self._real.cancelled()
 
@@ -52,7 +52,7 @@ class Telling:
         self.listener.read(self.token)
         return self._real.result()
 
-    def exception(self) -> BaseException | None:
+    def exception(self) -> Any:
         self.listener.read(self.token)
         return self._real.exception()
 
@@ -60,7 +60,7 @@ class Telling:
         self.listener.read(self.token)
         self._real.add_done_callback(fn, context=copy_context() if context is None else context)
 
-    def __await__(self) -> Generator[Any, None, Any]:
+    def __await__(self) -> Any:
         self.listener.read(self.token)
         return self._real.__await__()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import inspect
 import random
 import sys
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
 ASYNCIO = asyncio.__file__.rpartition("/")[0]
 ORDERS = 0
 """In place of the id of a message: commands come in order."""
-ACTOR: Any = Cell.actor
+ACTOR: Any = vars(Cell.__base__)["actor"]
 GATHERED = "gather.<locals>._done_callback"
 WAKE_UPS = ("_set_result_unless_cancelled", "_release_waiter")
 """Timers of asyncio that end a wait, and do nothing else."""
@@ -182,6 +183,7 @@ class Watch:
     def callback(self, option: Option) -> None:
         """A callback is called."""
         key, handle, has_place = option
+        context: Any = handle._context  # type: ignore[attr-defined]  # no stub has it
         made = self._made.pop(id(handle), -1)
         owner: Any = key
         self._begin(self.name(key), {made} if made >= 0 else set())
@@ -189,11 +191,11 @@ class Watch:
             lane = lane_of(handle)
             self._lanes[lane].popleft()
             self._stepped.keep_place(lane, made)
-        place = handle._context.get(inside)
+        place = context.get(inside)
         if place is not None and type(place) is not Root:
             self._writes.add(EVERYTHING)
         elif isinstance(owner, asyncio.Task):
-            self._step_of(owner, handle._context)
+            self._step_of(owner, context)
         elif type(owner) is not Node:
             self._call(handle)
 
@@ -219,16 +221,15 @@ class Watch:
 
     def _call(self, handle: Any) -> None:
         callback = handle._callback
-        owner = getattr(callback, "__self__", None)
-        if isinstance(owner, LoopTimer):
-            self._writes.add(("actor", owner._cell.path))
+        if isinstance(callback, types.MethodType) and isinstance(callback.__self__, LoopTimer):
+            self._writes.add(("actor", callback.__self__._cell.path))
             return
-        if _is_gathered(callback) and _has_succeeded(*handle._args):
+        function = _function_of(callback)
+        if _is_gathered(function) and _has_succeeded(*handle._args):
             return  # In which order they come is the same to whoever has gathered them.
-        code = getattr(inspect.unwrap(getattr(callback, "func", callback)), "__code__", None)
-        if type(handle) is asyncio.TimerHandle and getattr(callback, "__name__", "") in WAKE_UPS:
+        if type(handle) is asyncio.TimerHandle and function is not None and function.__name__ in WAKE_UPS:
             return
-        self._code_of(handle._context, [] if code is None else [code.co_filename])
+        self._code_of(handle._context, [] if function is None else [function.__code__.co_filename])
 
     def _code_of(self, context: Any, files: list[str]) -> None:
         """The memory that the code of a step has."""
@@ -316,8 +317,17 @@ class Watch:
         return found
 
 
-def _is_gathered(callback: Any) -> bool:
-    return isinstance(callback, types.FunctionType) and callback.__qualname__ == GATHERED
+def _function_of(callback: Any) -> types.FunctionType | None:
+    """The function in Python that a callback is made of; None: it is another thing."""
+    while isinstance(callback, functools.partial):
+        callback = callback.func
+    if isinstance(callback, types.MethodType):
+        callback = callback.__func__
+    return callback if isinstance(callback, types.FunctionType) else None
+
+
+def _is_gathered(function: types.FunctionType | None) -> bool:
+    return function is not None and function.__qualname__ == GATHERED
 
 
 def _has_succeeded(future: Any) -> bool:

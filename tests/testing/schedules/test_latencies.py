@@ -227,7 +227,7 @@ def test_a_late_frame_is_found_repeated_and_made_as_short_as_it_may_be() -> None
         simulate(slow, latency=late)()
     [note] = raised.value.__notes__
     schedule = note.partition('replay="')[2].partition('"')[0]
-    [(number, level)] = from_text(schedule)[1]["delay"].items()
+    [(number, level)] = from_text(schedule)[1]["latency"].items()
     assert late.row[level - 1] + late.row[0] < 0.1 <= late.row[level] + late.row[0]
     assert number > 0
     with pytest.raises(AssertionError) as again:
