@@ -264,7 +264,7 @@ class DiskWork:
     """
 
     def __init__(self, journal: SimulatedJournal, takes: What, call: Callable[[], Any]) -> None:
-        self.takes = takes
+        self.takes: What = takes
         self._disk, self._journal, self._call = journal.disk, journal, call
         self._newest = journal.disk.newest()
 
