@@ -353,10 +353,10 @@ CHECKS = {
         EXHAUSTIVE,
         "test_it_finds_whatever and an_outcome",
     ),
-    "shrinking ends in time": Check(
-        "testing/machines/shrink_time.py",
-        '            self._swaps.put(engine, "MAX_SHRINKING_SECONDS", seconds)\n',
-        "",
+    "shrinking that was cut short is told": Check(
+        "testing/machines/machine.py",
+        "        if self._shrinking.end():\n",
+        "        self._shrinking.end()\n        if False:\n",
         "tests/testing/machines/test_machine.py",
         "test_shrinking_ends",
     ),
