@@ -186,7 +186,7 @@ def test_whoever_travels_loses_doubles_and_reorders_nothing(machine: type[Travel
         deadline=None,
         derandomize="HOLDFAST_TRAVELS" not in os.environ,
         database=None,
-        suppress_health_check=list(HealthCheck),
+        suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.filter_too_much],
         phases=[Phase.generate, Phase.shrink],
     )
     run_state_machine_as_test(machine, settings=drawn)

@@ -465,6 +465,11 @@ CHECKS = {
         "testing/machines/shrink_time.py",
         '            self._swaps.put(engine, "MAX_SHRINKING_SECONDS", seconds)\n',
         "",
+    ),
+    "shrinking that was cut short is told": Check(
+        "testing/machines/machine.py",
+        "        if self._shrinking.end():\n",
+        "        self._shrinking.end()\n        if False:\n",
         "tests/testing/machines/test_machine.py",
         "test_shrinking_ends",
     ),

@@ -84,8 +84,6 @@ class TellingFuture(Telling, NumberedFuture[T]):
         self.listener.write(self.token)
         super().set_exception(exception)
 
-    __iter__ = Telling.__await__
-
 
 class TellingTask(Telling, NumberedTask[T]):
     """A task of such a run."""

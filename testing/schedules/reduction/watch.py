@@ -9,7 +9,7 @@ import random
 import sys
 import types
 from collections import defaultdict, deque
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Generator, Hashable
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -86,7 +86,7 @@ class Watch:
             self._set[token] = self._number
 
     @contextmanager
-    def _silence(self) -> Iterator[None]:
+    def _silence(self) -> Generator[None]:
         """What is looked at here changes nothing that anybody could see."""
         was, self._is_silent = self._is_silent, True
         try:

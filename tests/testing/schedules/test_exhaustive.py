@@ -205,5 +205,6 @@ def test_a_bounded_search_that_is_cut_short_says_what_it_has_covered() -> None:
 
 @pytest.mark.parametrize("settings", [{"holds": -1}, {"holds": True}, {"holds": 1, "strategy": "mixed"}])
 def test_a_bound_that_cannot_be_is_refused(settings: dict[str, Any]) -> None:
+    given: dict[str, Any] = {"strategy": "exhaustive", **settings}
     with pytest.raises(hf.SpecError, match="holds must be 0 or more"):
-        simulate(PLANTED["lost_update"], **{"strategy": "exhaustive", **settings})
+        simulate(PLANTED["lost_update"], **given)
