@@ -122,7 +122,6 @@ class Simulation:
         self._store: object = None
         self._roots: list[Root] = []  # each after the first has succeeded one that was killed
         self._life = contextlib.AsyncExitStack()  # of the system that lives
-        self._fleet_life = contextlib.AsyncExitStack()
         self._fleet: GuardedFleet | None = None
         self._make: Callable[[], GuardedSystem] = GuardedSystem
         self._test: asyncio.Task[Any] | None = None
@@ -133,7 +132,6 @@ class Simulation:
         self.world: World | None = None
         self._control: Control | None = None  # There is none before the system has been started.
         self._log = TurnLog(self.trace)
-        self._swaps = Swaps()
         self._ends: list[Callable[[], None]] = []
         self._surroundings = contextlib.ExitStack()
 
@@ -186,7 +184,7 @@ class Simulation:
         self._make, self._test, self._looks = make, asyncio.current_task(), looks
         loop.sync_seconds = self._seconds("syncs", self._sync)
         loop.pipe_seconds = self._seconds("latencies", self.latency)
-        self._swaps.put(worker_node, "_apply", no_limits)
+        self._surroundings.enter_context(Swaps()).put(worker_node, "_apply", no_limits)
 
         def watch(node: Node, name: str) -> None:
             if recorder is not None:
@@ -197,8 +195,7 @@ class Simulation:
         node = None if root is None else root.system._node
         self._control = Control(self.choices, self._log, node, loop, on_node=watch)
         if has_fleet:
-            fleet = GuardedFleet(self.choices, loop, options, self._look_at)
-            self._fleet = await self._fleet_life.enter_async_context(fleet)
+            self._fleet = GuardedFleet(self.choices, loop, options, self._look_at)
 
     def _seconds(self, what: str, given: Seconds) -> Callable[[], float]:
         return functools.partial(Dice(what, self.seed, self.choices).seconds, *given)
@@ -237,7 +234,8 @@ class Simulation:
     async def end(self, kind: Any = None, error: Any = None, trace: Any = None) -> None:
         """End the fleet, and the system that lives."""
         try:
-            await self._fleet_life.__aexit__(kind, error, trace)
+            if self._fleet is not None:
+                await self._fleet.close()
         finally:
             await self._life.__aexit__(kind, error, trace)
 
@@ -330,7 +328,6 @@ class Simulation:
         """Leave the system as it was."""
         if self._control is not None:
             self._control.remove()
-        self._swaps.undo()
         self.stop_recording()
         self._surroundings.close()
 
