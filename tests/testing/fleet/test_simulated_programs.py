@@ -96,8 +96,9 @@ async def led(fleet: SimFleet) -> SimProgram:
 
 def fails(test: Test, **options: Any) -> str:
     """The failure of a simulated test, with its notes."""
+    said: dict[str, Any] = {"seed": 0, **options}
     try:
-        simulate(test, **{"seed": 0, **options})()
+        simulate(test, **said)()
     except Exception as error:
         return "\n".join([str(error), *error.__notes__])
     raise AssertionError("it passes")
