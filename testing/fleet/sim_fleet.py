@@ -284,7 +284,8 @@ class SimFleet:
 
     def make_system(self, name: str, options: dict[str, Any]) -> ActorSystem:
         """A system for one of the programs."""
-        return ActorSystem(name, **{"log": False, **options})
+        told: dict[str, Any] = {"log": False, **options}
+        return ActorSystem(name, **told)
 
     def end(self, program: SimProgram) -> None:
         """Have nothing of a program reach anybody any more."""
