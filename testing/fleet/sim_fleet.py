@@ -23,7 +23,7 @@ from ..guarded import is_controlled
 from ..schedules.choices import Choices
 from ..schedules.places import ProgramPlace, inside
 from .broker import NO_FAULTS, BrokerFaults, SimBroker
-from .frame_faults import AS_USUAL, POST, REQUEST, Fate, FrameFaults
+from .frame_faults import AS_USUAL, POST, REQUEST, Fate, SendFaults
 from .post import NO_POST_FAULTS, PostFaults, SimPost, SimTransport
 from .same_loop import SameLoop
 from .sim_engine import SimEngine, SimLink
@@ -224,7 +224,7 @@ class SimFleet:
         self.seed, self._faults, self._choices = seed, faults, choices
         self.draw = random.Random(f"fleet {seed}")
         self.post = SimPost(seed, post_faults, choices=choices)
-        self.frames = FrameFaults(self.later)
+        self.frames = SendFaults(self.later)
         self.name = "the fleet"
         self.parties: list[SimServers] = []
         self._nowhere = Context()
