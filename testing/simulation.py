@@ -126,7 +126,6 @@ class Simulation:
         self._store: object = None
         self._roots: list[Root] = []  # each after the first has succeeded one that was killed
         self._life = contextlib.AsyncExitStack()  # of the system that lives
-        self._fleet_life = contextlib.AsyncExitStack()
         self._fleet: GuardedFleet | None = None
         self._make: Callable[[], GuardedSystem] = GuardedSystem
         self._test: asyncio.Task[Any] | None = None
@@ -137,7 +136,6 @@ class Simulation:
         self.world: World | None = None
         self._control: Control | None = None  # There is none before the system has been started.
         self._log = TurnLog(self.trace)
-        self._swaps = Swaps()
         self._over: int | None = None  # after so many turns
         self._ends: list[Callable[[], None]] = []
         self._surroundings = contextlib.ExitStack()
@@ -193,7 +191,8 @@ class Simulation:
         loop.latencies = self._latencies
         if "replies" in self._latencies:
             loop.late_replies = LateReplies(loop, self._latencies.of("replies"))
-        self._swaps.put(worker_node, "_apply", no_limits)
+        swaps = self._surroundings.enter_context(Swaps())
+        swaps.put(worker_node, "_apply", no_limits)
 
         def watch(node: Node, name: str) -> None:
             if recorder is not None:
@@ -206,13 +205,12 @@ class Simulation:
             self._ends.append(recorder.listen())
         if notes:
             values = self._log.values = HandledValues(self._log)
-            self._swaps.put(Ask, "answer", values.answering(Ask.answer))
+            swaps.put(Ask, "answer", values.answering(Ask.answer))
         if loop.late_replies is not None:
-            self._swaps.put(Ask, "answer", loop.late_replies.delaying(Ask.answer))
+            swaps.put(Ask, "answer", loop.late_replies.delaying(Ask.answer))
         self._control = Control(self.choices, self._log, node, loop, on_node=watch)
         if has_fleet:
-            fleet = GuardedFleet(self.choices, loop, options, self._look_at)
-            self._fleet = await self._fleet_life.enter_async_context(fleet)
+            self._fleet = GuardedFleet(self.choices, loop, options, self._look_at)
 
     def _look_at(self, system: GuardedSystem) -> None:
         """Look at the messages of a system, or not."""
@@ -248,7 +246,8 @@ class Simulation:
     async def end(self, kind: Any = None, error: Any = None, trace: Any = None) -> None:
         """End the fleet, and the system that lives."""
         try:
-            await self._fleet_life.__aexit__(kind, error, trace)
+            if self._fleet is not None:
+                await self._fleet.close()
         finally:
             await self._life.__aexit__(kind, error, trace)
 
@@ -352,7 +351,6 @@ class Simulation:
         """Leave the system as it was."""
         if self._control is not None:
             self._control.remove()
-        self._swaps.undo()
         self.stop_recording()
         self._surroundings.close()
 

@@ -40,7 +40,7 @@ class Sent(NamedTuple):
         return f"what {self.program} sends to {self.to}"
 
 
-class FrameFaults:
+class SendFaults:
     """What strikes the programs of one fleet where they send something.
 
     Args:

@@ -7,7 +7,6 @@ choices of the run, which are kept, repeated and shrunk.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from ...system.system import ActorSystem
@@ -75,14 +74,6 @@ class GuardedFleet(SimFleet):
             program.bury()
         else:  # It is its own step that ends it, which goes to its end, and reaches nobody.
             self.later(0.0, program.bury)
-
-    async def __aenter__(self) -> GuardedFleet:
-        return self
-
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        await self.close()
 
 
 class FleetSystem(GuardedSystem):

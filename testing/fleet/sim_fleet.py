@@ -23,7 +23,7 @@ from ..guarded import is_controlled
 from ..schedules.choices import Choices
 from ..schedules.places import ProgramPlace, inside
 from .broker import NO_FAULTS, BrokerFaults, SimBroker
-from .frame_faults import AS_USUAL, POST, REQUEST, Fate, FrameFaults
+from .frame_faults import AS_USUAL, POST, REQUEST, Fate, SendFaults
 from .post import NO_POST_FAULTS, PostFaults, SimPost, SimTransport
 from .same_loop import SameLoop
 from .sim_engine import SimEngine, SimLink
@@ -224,7 +224,7 @@ class SimFleet:
         self.seed, self._faults, self._choices = seed, faults, choices
         self.draw = random.Random(f"fleet {seed}")
         self.post = SimPost(seed, post_faults, choices=choices)
-        self.frames = FrameFaults(self.later)
+        self.frames = SendFaults(self.later)
         self.name = "the fleet"
         self.parties: list[SimServers] = []
         self._nowhere = Context()
@@ -284,7 +284,8 @@ class SimFleet:
 
     def make_system(self, name: str, options: dict[str, Any]) -> ActorSystem:
         """A system for one of the programs."""
-        return ActorSystem(name, **{"log": False, **options})
+        told: dict[str, Any] = {"log": False, **options}
+        return ActorSystem(name, **told)
 
     def end(self, program: SimProgram) -> None:
         """Have nothing of a program reach anybody any more."""

@@ -496,7 +496,8 @@ async def test_post_faults_reach_the_client_of_a_program(kind: str, sim_fleet: S
     async with hf.connect(sim_fleet.servers(), timeout=60.0) as connection:
         ref, loop = connection.ref("/app/counter", Counter), asyncio.get_running_loop()
         assert await ref.ask(Add(1), timeout=60.0) == 1
-        async with faults.on(program, at="post", times=1, seconds=3.0, **{kind: 1.0}) as strikes:
+        odds: dict[str, Any] = {kind: 1.0}
+        async with faults.on(program, at="post", times=1, seconds=3.0, **odds) as strikes:
             asked = loop.time()
             try:
                 total = await ref.ask(Add(1), timeout=60.0)
@@ -515,7 +516,8 @@ async def test_request_faults_have_another_program_lead(kind: str, sim_fleet: Si
     async with hf.connect(sim_fleet.servers(), timeout=60.0):
         second = sim_fleet.start(serve_counter)
         await asyncio.sleep(1.0)
-        async with faults.on(first, at="request", times=1, seconds=20.0, after=2, **{kind: 1.0}):
+        odds: dict[str, Any] = {kind: 1.0}
+        async with faults.on(first, at="request", times=1, seconds=20.0, after=2, **odds):
             await asyncio.sleep(15.0)
             is_left_behind = "program 2" in faults.strikes[0].what
             assert second.leads != is_left_behind

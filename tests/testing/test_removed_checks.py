@@ -465,6 +465,8 @@ CHECKS = {
         "testing/machines/shrink_time.py",
         '            self._swaps.put(engine, "MAX_SHRINKING_SECONDS", seconds)\n',
         "",
+        "tests/testing/machines/test_machine.py",
+        "test_shrinking_ends",
     ),
     "shrinking that was cut short is told": Check(
         "testing/machines/machine.py",
@@ -545,7 +547,7 @@ CHECKS = {
     ),
     "the values of replies are compared": Check(
         "testing/simulation.py",
-        '            self._swaps.put(Ask, "answer", values.answering(Ask.answer))\n',
+        '            swaps.put(Ask, "answer", values.answering(Ask.answer))\n',
         "",
         SCHEDULES,
         "test_values_that_do_not_repeat and reply",

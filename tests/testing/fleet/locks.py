@@ -54,10 +54,11 @@ async def hold(servers: SimServers, held: dict[str, float], name: str, *, times:
     """Call the service anew and again, and see to it that nobody else holds what it gives."""
     loop = asyncio.get_running_loop()
     for _ in range(times):
+        asked = loop.time()
         try:
             async with hf.connect(servers, timeout=3.0) as connection:
-                lock, asked = connection.ref("/app/lock", Lock), loop.time()
-                is_given = await lock.ask(Grant(name), timeout=2.0)
+                asked = loop.time()
+                is_given = await connection.ref("/app/lock", Lock).ask(Grant(name), timeout=2.0)
         except (hf.AskTimeout, hf.AskFailed, hf.SendError):
             is_given = False
         if is_given and loop.time() < asked + LEASE:
