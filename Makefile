@@ -38,7 +38,7 @@ campaign: $(VENV)/.dev
 	HOLDFAST_REQUESTS=10000 HOLDFAST_STRIKES=2000 HOLDFAST_PROGRAMS=300 HOLDFAST_SOAK=60 HOLDFAST_REMOVED=1 \
 	    $(BIN)/python -m pytest -q -n 2 -s tests/ftm/test_campaign_faults.py tests/ftm/test_campaign.py \
 	    tests/ftm/test_random_hooks.py tests/ftm/test_soak.py tests/ftm/test_removed_checks.py
-	HOLDFAST_MATRIX=1700 HOLDFAST_LOADED_MOVES=50 HOLDFAST_BAD_CHANGES=1 $(BIN)/python -m pytest -q -n 2 -s \
+	HOLDFAST_TRAVELS=1000 HOLDFAST_LOADED_MOVES=50 HOLDFAST_BAD_CHANGES=1 $(BIN)/python -m pytest -q -n 2 -s \
 	    -o faulthandler_timeout=900 tests/migration tests/system/test_moves_under_load.py tests/ftm/test_bad_changes.py
 	HOLDFAST_TRANSACTIONS=1000 $(BIN)/python -m pytest -q -n 2 -s -o faulthandler_timeout=0 \
 	    tests/system/test_transactions_under_fire.py
@@ -48,6 +48,7 @@ campaign: $(VENV)/.dev
 	HOLDFAST_FLEETS=2000 HOLDFAST_SYSTEM_FLEETS=1000 HOLDFAST_ORDERLY_STOPS=300 HOLDFAST_COPIES=1 HOLDFAST_CROSSED=1 HOLDFAST_REMOVED=1 \
 	    $(BIN)/python -m pytest -q -n 2 -s tests/cluster/test_takeover.py tests/cluster/test_simulated_fleet.py \
 	    tests/cluster/test_stops_in_good_order.py tests/cluster/test_copy_faults.py tests/cluster/test_removed_checks.py
+	HOLDFAST_SIMULATED_FLEETS=1000 $(BIN)/python -m pytest -q -n 2 -o faulthandler_timeout=0 tests/testing/fleet
 	HOLDFAST_MACHINES=1000 $(BIN)/python -m pytest -q -n 2 -o faulthandler_timeout=0 tests/cluster/machines
 	HOLDFAST_REMOVED=1 $(BIN)/python -m pytest -q -n 2 -s tests/system/test_removed_checks.py \
 	    tests/actors/process/hostile/test_removed_claims.py tests/telemetry/test_removed_checks.py \

@@ -138,6 +138,8 @@ class _JumpingSelector(selectors.DefaultSelector):
         when = self._loop.next_timer()
         if when < math.inf:
             self.now = max(self.now, when)
+            if late := self._loop.lateness():
+                self._loop.pass_time(late)
             self.jumps += 1
             if self.jumps > self._most_jumps:
                 self.jumps = 0
@@ -203,6 +205,16 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         # asyncio runs what is due up to one resolution from now. This much is what is due now, and no later timer.
         self._clock_resolution = math.ulp(max(self._virtual.now, when)) if when < math.inf else self._clock_resolution
         return when
+
+    def lateness(self) -> float:
+        """Say by how many seconds the loop wakes too late for the next timer."""
+        return 0.0
+
+    def pass_time(self, seconds: float) -> None:
+        """Let time pass in which nothing happens here, as if a call had taken it."""
+        self._virtual.now += seconds
+        self._clock_resolution = math.ulp(self._virtual.now)  # Else a timer that is due right now would not be.
+        self.forget_ticks()
 
     def run_forever(self) -> None:
         """Run as every loop does; each run may take so many ticks and jumps."""

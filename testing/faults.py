@@ -6,18 +6,21 @@ the context is open. Production code has no hooks for it and pays nothing.
 
 from __future__ import annotations
 
-import math
 import random
 from collections.abc import Callable
 from types import TracebackType
-from typing import Any, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 from ..actors.errors import HoldfastError, SpecError
 from ..actors.kernel.ref import ActorRef
 from ..system.system import ActorSystem
-from .schedules.choices import DELAY, FAULT, LEVELS, Choices
+from .latencies import Latency, row_of
+from .schedules.choices import DELAY, FAULT, Choices
 
-Kind = Literal["crash", "hang", "delay", "drop", "duplicate", "reorder", "corrupt", "fail"]
+if TYPE_CHECKING:
+    from .fleet.sim_fleet import SimFleet, SimProgram
+
+Kind = Literal["crash", "hang", "delay", "drop", "duplicate", "reorder", "corrupt", "fail", "cut", "split"]
 KINDS: tuple[str, ...] = get_args(Kind)
 
 
@@ -94,6 +97,18 @@ POINTS: dict[str, Point] = {
             ("fail", "crash", "delay"),
             "the start fails and is tried again within the supervisor's intensity",
         ),
+        Point(
+            "post",
+            "what a program of a simulated fleet sends another program, or a client",
+            ("crash", "cut", "split", "drop", "delay", "duplicate"),
+            "crash, cut, split: another program leads; an ask to a recorded actor has one outcome",
+        ),
+        Point(
+            "request",
+            "what such a program asks of the servers of its system: for the log, the lease and large values",
+            ("crash", "cut", "split", "drop"),
+            "what was acknowledged stands in the log, and whoever leads next has it",
+        ),
     )
 }
 """Every point, by name."""
@@ -131,7 +146,7 @@ class Strikes:
         path: str,
         point: Point,
         odds: dict[Kind, float],
-        seconds: float | tuple[float, float],
+        seconds: Latency,
         after: int,
         times: int | None,
         *,
@@ -139,11 +154,11 @@ class Strikes:
     ) -> None:
         self.at, self.path, self.seed = point.name, path, faults.seed
         self.replays = replays
-        self.least, self.longest = seconds if isinstance(seconds, tuple) else (seconds, seconds)
         self.chances = 0
         self.is_over = False
         self.struck: list[Strike] = []
-        self.draw = random.Random(f"{faults.seed}|{path}|{point.name}|{len(faults.installed)}")
+        named = f"{faults.seed}|{path}|{point.name}|{len(faults.installed)}"
+        self.draw, self._row = random.Random(named), row_of("faults", "seconds", seconds, random.Random(f"row {named}"))
         self._faults, self._odds, self._after, self._times = faults, odds, after, times
         self._undo: list[Callable[[], None]] = []
 
@@ -172,12 +187,21 @@ class Strikes:
 
     def delay(self) -> float:
         """Return how long the delay that strikes now is, in seconds."""
-        if self.least == self.longest:
-            return self.least
-        level = self.draw.randrange(LEVELS)
-        if self._faults.choices is not None:
-            level = self._faults.choices.draw(DELAY, LEVELS, level)
-        return self.least + (self.longest - self.least) * level / (LEVELS - 1)
+        count = len(self._row)
+        level = self.draw.randrange(count) if count > 1 else 0
+        if self._faults.choices is not None and count > 1:
+            level = self._faults.choices.draw(DELAY, count, level)
+        return self._row[level]
+
+    def tell(self, what: str) -> None:
+        """Say more of what the last fault has hit."""
+        told = self.struck[-1]._replace(what=what)
+        self.struck[-1] = self._faults.strikes[-1] = told
+
+    def is_hit(self) -> bool:
+        """Draw whether one more is hit by a fault that strikes several: half of them are."""
+        drawn = self.draw.random() < 0.5
+        return drawn if self._faults.choices is None else bool(self._faults.choices.draw(FAULT, 2, int(drawn)))
 
     def crash(self) -> InjectedCrash:
         """Return the exception of a crash that strikes now."""
@@ -230,10 +254,10 @@ class Faults:
 
     def on(
         self,
-        target: ActorRef[Any] | ActorSystem,
+        target: ActorRef[Any] | ActorSystem | SimFleet | SimProgram,
         *,
         at: str,
-        seconds: float | tuple[float, float] = 1.0,
+        seconds: Latency = 1.0,
         after: int = 0,
         times: int | None = None,
         replays: bool = False,
@@ -242,16 +266,17 @@ class Faults:
         """Faults at one point, from now to the end of the context: `async with faults.on(ref, at="admit", drop=0.1):`.
 
         Args:
-            target: the actor; for "process start" the system.
+            target: the actor; for "process start" the system; for "post" and "request" a program of a simulated fleet,
+                or the fleet, for all of its programs, also those that are started later.
             at: a name in POINTS.
-            seconds: how long a delay is, on the loop's clock; (least, longest): each is drawn. What is reordered comes
-                after the next message, or so much later if there is none.
+            seconds: how long a delay is, on the loop's clock, or how long a program stays cut off, as a latency of
+                `simulate` is said. What is reordered comes after the next message, or so much later if there is none.
             after: this many chances are let pass first.
             times: at most so many strikes; None: no limit.
             replays: at "turn begin" and "turn end": the turns of a replay are chances, too. Left out, only turns that
                 no life has ended before are.
-            odds: by kind of fault (crash, hang, delay, drop, duplicate, reorder, corrupt, fail), the probability with
-                which it strikes at each chance; together at most 1.
+            odds: by kind of fault (crash, hang, delay, drop, duplicate, reorder, corrupt, fail, cut, split), the
+                probability with which it strikes at each chance; together at most 1.
 
         Raises:
             SpecError: there is no such point, the fault cannot strike there, or the target has no such point.
@@ -262,8 +287,6 @@ class Faults:
         if point is None:
             raise SpecError("faults", f"at must be one of {', '.join(POINTS)}, not {at!r}")
         strikes = Strikes(self, _path(target), point, _checked(point, odds), seconds, after, times, replays=replays)
-        if not 0 <= strikes.least <= strikes.longest < math.inf:
-            raise SpecError("faults", f"seconds must be >= 0, or (least, longest), not {seconds!r}")
         if replays and at not in TURNS:
             raise SpecError("faults", f"replays=True is for {' and '.join(map(repr, TURNS))}, not for {at!r}")
         INSTALL[at](strikes, target)
@@ -279,8 +302,10 @@ class Faults:
         return f"<Faults seed={self.seed}, {len(self.strikes)} struck>"
 
 
-def _path(target: ActorRef[Any] | ActorSystem) -> str:
-    return target.path if isinstance(target, ActorRef) else f"/{target.name}"
+def _path(target: ActorRef[Any] | ActorSystem | SimFleet | SimProgram) -> str:
+    if isinstance(target, ActorRef):
+        return target.path
+    return f"/{target.name}" if isinstance(target, ActorSystem) else target.name
 
 
 def _checked(point: Point, odds: dict[str, float]) -> dict[Kind, float]:

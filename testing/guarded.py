@@ -60,7 +60,7 @@ class UnexpectedEnd(HoldfastError, AssertionError, text="{problems:\n}"):
     problems: tuple[str, ...]
 
 
-def _is_controlled(loop: asyncio.AbstractEventLoop) -> TypeGuard[ControlledLoop]:
+def is_controlled(loop: asyncio.AbstractEventLoop) -> TypeGuard[ControlledLoop]:
     """Whether a run is simulated in this loop."""
     if not isinstance(loop, VirtualClockLoop):
         return False
@@ -95,7 +95,7 @@ class GuardedSystem(ActorSystem):
 
     def _make_pool(self, node: Node) -> Workers:
         loop = asyncio.get_running_loop()
-        if _is_controlled(loop):
+        if is_controlled(loop):
             from .schedules.processes import SimulatedWorkers
 
             return SimulatedWorkers(node, loop)
@@ -103,7 +103,7 @@ class GuardedSystem(ActorSystem):
 
     def _host_for(self, spec: ChildSpec) -> AddressHost:
         loop = self._node.loop
-        if spec.isolation == "process" and isinstance(loop, VirtualClockLoop) and not _is_controlled(loop):
+        if spec.isolation == "process" and isinstance(loop, VirtualClockLoop) and not is_controlled(loop):
             raise RealTimeNeeded(f"{spec.id!r} with isolation='process'")
         return super()._host_for(spec)
 
@@ -136,8 +136,7 @@ class GuardedSystem(ActorSystem):
 
     def succeed(self, before: GuardedSystem) -> None:
         """Go on for a system whose root was killed: what the test expects holds on, and what it has seen counts on."""
-        before._ends = True
-        before.look_away()
+        before.was_killed()
         self.crashes, before.crashes = before.crashes, []
         self.letters, before.letters = before.letters, []
         of_the_killed = Expected()
@@ -147,6 +146,16 @@ class GuardedSystem(ActorSystem):
         self.are_exceptions_expected = before.are_exceptions_expected
         if self._checks is not None and before._checks is not None:
             self._checks.expect_as(before._checks)
+
+    def was_killed(self) -> None:
+        """Nothing of it runs any more: what is still told there is only how it is taken apart."""
+        self._ends = True
+        self.look_away()
+
+    def join(self, others: GuardedSystem) -> None:
+        """Have what a test expects of others, crashes and dead letters, hold of this one and them together."""
+        self.crashes, self.letters = others.crashes, others.letters
+        self._expected_crashes, self._expected_letters = others._expected_crashes, others._expected_letters
 
     def expect_replies(self) -> None:
         """Do not complain of replies that share an object with the state of the actor that gave them."""

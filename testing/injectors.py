@@ -27,10 +27,11 @@ from ..checkpoint.life.recorded_inbox import Fed
 from ..system.system import ActorSystem
 from .damage import damaged
 from .faults import Strikes
+from .fleet.sim_fleet import SimFleet, SimProgram
 from .swaps import Swaps
 from .turns import Substitute, TurnWatcher, watch_turns
 
-Target = ActorRef[Any] | ActorSystem
+Target = ActorRef[Any] | ActorSystem | SimFleet | SimProgram
 
 
 def _cell(strikes: Strikes, target: Target) -> Cell:
@@ -452,6 +453,17 @@ def process(strikes: Strikes, target: Target) -> None:
     strikes.at_end(swaps.undo)
 
 
+def program(strikes: Strikes, target: Target) -> None:
+    """Install at "post" or "request"."""
+    match target:
+        case SimProgram():
+            target.fleet.frames.add(strikes, target)
+        case SimFleet():
+            target.frames.add(strikes, None)
+        case _:
+            raise SpecError("faults", f"{strikes.at!r} is a point of a simulated fleet: give that, or a program of it")
+
+
 INSTALL: dict[str, Callable[[Strikes, Target], None]] = {
     "admit": admit,
     "turn begin": turn,
@@ -462,5 +474,7 @@ INSTALL: dict[str, Callable[[Strikes, Target], None]] = {
     "journal append": journal,
     "snapshot write": journal,
     "process start": process,
+    "post": program,
+    "request": program,
 }
 """What installs the faults of each point."""

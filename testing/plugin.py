@@ -91,14 +91,21 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--holdfast-profile",
         choices=PROFILES,
         default="ci",
-        help="ci: as many seeds as a test says; nightly: 25 times as many",
+        help="ci: as many seeds as a test says; nightly: 25 times as many, and each run is made twice",
+    )
+    group.addoption(
+        "--holdfast-twice",
+        metavar="N",
+        type=_count,
+        default=None,
+        help="make every Nth run of a simulated test twice, to see whether its seed repeats it (10; nightly: 1)",
     )
 
 
 def _count(text: str) -> int:
     """How many: at least one, or the tests would pass without having run."""
     if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is no number of seeds: it takes one or more")
+        raise argparse.ArgumentTypeError(f"{text!r} is no number: it takes one or more")
     return int(text)
 
 

@@ -14,36 +14,36 @@ import contextlib
 import dataclasses
 import functools
 import inspect
-import math
 import os
 import random
 import sys
 import tempfile
 import traceback
 import warnings
-from collections.abc import Callable, Coroutine, Iterable
+from collections.abc import Callable, Collection, Coroutine, Iterable
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, Final
 from unittest import SkipTest
 
-from ..actors.errors import AskFailed, HoldfastError, SpecError
-from ..actors.kernel.cell import GONE
-from ..actors.kernel.mailbox import admit_gone
+from ..actors.errors import HoldfastError, SpecError
+from ..actors.kernel.envelope import Ask
 from ..actors.kernel.node import Node
 from ..actors.kernel.ref import ActorRef, current
-from .barrier import waiter_of
+from ..actors.process import worker_node
+from .charts.causes import leading
+from .charts.chart_html import as_html as chart_as_html
+from .charts.chart_recorder import Recorder
+from .charts.chart_text import as_text as chart_as_text
 from .clock import TICKS
 from .faults import Faults
+from .fleet.guarded_fleet import GuardedFleet
 from .guard.leaks import Leaks
 from .guard.loop_leaks import LoopLeaks
-from .guard.loop_methods import LoopMethods
 from .guarded import GuardedSystem, UnexpectedEnd
+from .latencies import Latencies, Latency, LateReplies, Said, What, said_latencies
 from .library_code import is_file_of_library
 from .schedules.bound_names import BoundNames, names_of
-from .schedules.charts import Recorder
-from .schedules.charts import as_html as chart_as_html
-from .schedules.charts import as_text as chart_as_text
 from .schedules.choices import (
     MOMENT,
     TURN,
@@ -58,7 +58,7 @@ from .schedules.choices import (
     size,
 )
 from .schedules.control import Control, ControlledLoop
-from .schedules.disk import PATH, Latency, NoRootToKill, SimulatedDisk
+from .schedules.disk import PATH, NoRootToKill, SimulatedDisk
 from .schedules.hash_seeds import (
     RANDOM,
     PassesElsewhere,
@@ -71,12 +71,12 @@ from .schedules.hash_seeds import (
     with_hash_seed,
 )
 from .schedules.places import Root, inside
-from .schedules.processes import SimulatedWorkers
-from .schedules.shrinking import shrink
+from .schedules.processes import no_limits
+from .schedules.shrinking import FailedRun, shrink
 from .schedules.strategies import DEPTH, mixed
 from .schedules.strategies import strategy as strategy_of
 from .schedules.time_limits import TimeLimit, is_of_time_limit
-from .schedules.turn_log import TurnLog
+from .schedules.turn_log import Handled, HandledValues, TurnLog, parting
 from .schedules.world import World
 from .swaps import Swaps
 from .turns import Tracer, watch_turns
@@ -84,8 +84,11 @@ from .wanted import SystemsWanted, running
 
 SEED = "HOLDFAST_SEED"
 """The environment variable that picks one seed for every simulated test of a run."""
-TWICE = 10
-"""Every so manieth run is made twice, to see whether its choices repeat it: the first one, too, and each failure."""
+LOOKS = 10
+"""In every so manieth run each message is looked at."""
+TWICE = {"ci": 10, "nightly": 1}
+"""By profile: every so manieth run is made twice, to see whether its choices repeat it. The first one is, and each that
+fails."""
 REAL_RUNS = 3
 """How often a test is run on a real loop, if nothing else is said."""
 NIGHTLY = 25
@@ -96,9 +99,9 @@ class NotExhausted(UserWarning):
     """An exhaustive search has ended before it had tried every schedule."""
 
 
+OF_STORE: Final[tuple[What, ...]] = ("reads", "writes", "syncs")
+"""What takes time only in a simulated store."""
 Test = Callable[..., Coroutine[Any, Any, None]]
-Seconds = tuple[float, float]
-"""The least and the longest."""
 
 
 class Simulation:
@@ -106,7 +109,8 @@ class Simulation:
 
     Attributes:
         seed: what decides.
-        trace: (address, what was handled) of each turn, in the order in which they began.
+        trace: (address, what was handled) of each turn, in the order in which they began. Before an address in a fleet
+            stands the name of the program: `program 1:/bank/ledger`.
         choices: what was chosen.
         faults: those of the seed.
         disk: the simulated store, which outlives the root; None: there is none.
@@ -116,12 +120,13 @@ class Simulation:
 
     is_real = False
 
-    def __init__(self, choices: Choices, latency: Seconds = (0.0, 0.0), sync: Seconds = (0.0, 0.0)) -> None:
-        self.seed, self.latency, self._sync = choices.seed, latency, sync
+    def __init__(self, choices: Choices, latency: Said = 0.0, sync: Latency = 0.0) -> None:
+        self.seed, self._latencies = choices.seed, Latencies(choices, said_latencies(latency, sync))
         self.disk: SimulatedDisk | None = None
         self._store: object = None
         self._roots: list[Root] = []  # each after the first has succeeded one that was killed
         self._life = contextlib.AsyncExitStack()  # of the system that lives
+        self._fleet: GuardedFleet | None = None
         self._make: Callable[[], GuardedSystem] = GuardedSystem
         self._test: asyncio.Task[Any] | None = None
         self._draw = random.Random(f"moments {choices.seed}")
@@ -131,7 +136,7 @@ class Simulation:
         self.world: World | None = None
         self._control: Control | None = None  # There is none before the system has been started.
         self._log = TurnLog(self.trace)
-        self._swaps = Swaps()
+        self._over: int | None = None  # after so many turns
         self._ends: list[Callable[[], None]] = []
         self._surroundings = contextlib.ExitStack()
 
@@ -145,17 +150,37 @@ class Simulation:
         """List what the run has used that no seed decides."""
         return () if self.world is None else tuple(self.world.escaped)
 
+    @property
+    def system(self) -> GuardedSystem:
+        """The system that the test has."""
+        return self._roots[-1].system
+
+    @property
+    def fleet(self) -> GuardedFleet:
+        """The fleet that the test has."""
+        assert self._fleet is not None
+        return self._fleet
+
     async def begin(
-        self, options: dict[str, Any], recorder: Recorder | None = None, *, looks: bool = True
-    ) -> GuardedSystem:
-        """Start the system; from here on the seed decides."""
+        self,
+        options: dict[str, Any],
+        recorder: Recorder | None = None,
+        *,
+        looks: bool = True,
+        notes: bool = False,
+        own: Collection[str] = ("system",),
+    ) -> None:
+        """Start what the test has, of `system` and `fleet`, or a system if it has neither; then the seed decides."""
         loop = asyncio.get_running_loop()
         assert isinstance(loop, ControlledLoop)
+        has_fleet = "fleet" in own
+        if has_fleet and "system" not in own and options.get("store") is not None:
+            raise SpecError("simulate", "store= is of the system of the test; that of a fleet are its own servers")
         self._store = options.get("store")  # The marker of the test may name it, too.
         if self._store == PATH:
-            self.disk = SimulatedDisk()
-        elif self._sync != (0.0, 0.0):
-            raise SpecError("simulate", f"sync= is how long a sync of the simulated store takes: give store={PATH!r}")
+            self.disk = SimulatedDisk(loop.hold_up)
+        elif said := next((what for what in OF_STORE if what in self._latencies), None):
+            raise SpecError("simulate", f"{said} of the simulated store would take time: give store={PATH!r}")
 
         def make() -> GuardedSystem:
             if self.disk is not None:
@@ -163,15 +188,36 @@ class Simulation:
             return GuardedSystem(**options)
 
         self._make, self._test, self._looks = make, asyncio.current_task(), looks
-        loop.sync_seconds = Latency(self.choices, "syncs", self._sync)
+        loop.latencies = self._latencies
+        if "replies" in self._latencies:
+            loop.late_replies = LateReplies(loop, self._latencies.of("replies"))
+        swaps = self._surroundings.enter_context(Swaps())
+        swaps.put(worker_node, "_apply", no_limits)
 
-        def watch(node: Node) -> None:
+        def watch(node: Node, name: str) -> None:
             if recorder is not None:
+                recorder.call(node, name)
                 self._ends.append(watch_turns(node, recorder))
 
-        root = await self._start()
-        self._control = Control(self.choices, self._log, root.node, loop, on_node=watch)
-        return root.system
+        root = None if has_fleet and "system" not in own else await self._start()
+        node = None if root is None else root.system._node
+        if recorder is not None:
+            self._ends.append(recorder.listen())
+        if notes:
+            values = self._log.values = HandledValues(self._log)
+            swaps.put(Ask, "answer", values.answering(Ask.answer))
+        if loop.late_replies is not None:
+            swaps.put(Ask, "answer", loop.late_replies.delaying(Ask.answer))
+        self._control = Control(self.choices, self._log, node, loop, on_node=watch)
+        if has_fleet:
+            self._fleet = GuardedFleet(self.choices, loop, options, self._look_at)
+
+    def _look_at(self, system: GuardedSystem) -> None:
+        """Look at the messages of a system, or not."""
+        if not self._looks:
+            system.look_away()
+        elif self.world is not None:
+            system.read_along(self.world.look_for_addresses)
 
     async def _start(self) -> Root:
         """Start the next system, all of whose callbacks are marked as its root's."""
@@ -186,15 +232,9 @@ class Simulation:
             raise
         finally:
             inside.reset(mark)
-        root.node, root.is_up = root.system._node, True
+        root.is_up = True
         root.system._body = self._test
-        pool = root.system._workers
-        if isinstance(pool, SimulatedWorkers):
-            pool.draw_from(self.choices, self.latency)
-        if not self._looks:
-            root.system.look_away()
-        elif self.world is not None:
-            root.system.read_along(self.world.look_for_addresses)
+        self._look_at(root.system)
         return root
 
     def told_of_its_end(self) -> None:
@@ -204,21 +244,29 @@ class Simulation:
             loop.end_by(None)
 
     async def end(self, kind: Any = None, error: Any = None, trace: Any = None) -> None:
-        """End the system that lives."""
-        await self._life.__aexit__(kind, error, trace)
+        """End the fleet, and the system that lives."""
+        try:
+            if self._fleet is not None:
+                await self._fleet.close()
+        finally:
+            await self._life.__aexit__(kind, error, trace)
 
     def problems(self) -> list[str]:
         """List what happened and was not expected, as texts."""
-        return [problem for root in self._roots for problem in root.system.problems()]
+        return [problem for system in self._systems() for problem in system.problems()]
 
     def asks(self) -> dict[asyncio.Future[Any], tuple[str, object]]:
         """List what was asked in the run, and of whom."""
-        return {future: asked for root in self._roots for future, asked in root.system.asks.items()}
+        return {future: asked for system in self._systems() for future, asked in system.asks.items()}
 
     @property
     def are_exceptions_expected(self) -> bool:
         """Say whether exceptions may go unseen."""
-        return any(root.system.are_exceptions_expected for root in self._roots)
+        return any(system.are_exceptions_expected for system in self._systems())
+
+    def _systems(self) -> list[GuardedSystem]:
+        """All that there have been."""
+        return [*(root.system for root in self._roots), *(() if self._fleet is None else self._fleet.systems)]
 
     async def moment(self, turns: int = 100) -> None:
         """Wait for a drawn number of turns of actors, and no longer than until nothing else can happen."""
@@ -255,6 +303,8 @@ class Simulation:
             raise NoRootToKill(f"its store is {self._store!r}, which the killed root would still hold: take {PATH!r}")
         if current.get(None) is not None or inside.get() is not None:
             raise NoRootToKill("an actor cannot do it, only the test")
+        if not self._roots:
+            raise NoRootToKill("the test has no system of its own: kill a program of its fleet (fleet.kill)")
         before = self._roots[-1]
         if not before.is_up:
             raise NoRootToKill("it was killed, and is being started again")
@@ -265,8 +315,6 @@ class Simulation:
             self.disk.cut_power(self.choices)
         root = await self._start()
         root.system.succeed(before.system)
-        assert self._control is not None
-        self._control.add(root.node)
         return root.system
 
     def kill_process(self, ref: ActorRef[Any]) -> None:
@@ -275,13 +323,27 @@ class Simulation:
         Raises:
             SpecError: it has none now.
         """
-        worker = self._roots[-1].system._workers.of(ref._cell)
+        node = ref._cell.node
+        systems = [*(() if self._fleet is None else self._fleet.systems), *(root.system for root in self._roots[-1:])]
+        found = next((system for system in systems if system._running is node), None)
+        worker = None if found is None else found._workers.of(ref._cell)
         if worker is None:
             raise SpecError(ref.path, "it has no process of its own")
         worker.forked.kill()
 
+    @property
+    def handled(self) -> list[Handled]:
+        """The values of messages and replies, in order, if they were noted."""
+        return [] if self._log.values is None else self._log.values.handled
+
+    def extent(self) -> tuple[int, int]:
+        """Return how many turns the test has had before it was over, and of how many actors."""
+        turns = self.trace[: self._over]
+        return len(turns), len({path for path, _ in turns})
+
     def stop_recording(self) -> None:
         """Record no more for the chart: the test is over, and how its actors end is none of it."""
+        self._over = len(self.trace) if self._over is None else self._over
         while self._ends:
             self._ends.pop()()
 
@@ -289,7 +351,6 @@ class Simulation:
         """Leave the system as it was."""
         if self._control is not None:
             self._control.remove()
-        self._swaps.undo()
         self.stop_recording()
         self._surroundings.close()
 
@@ -304,15 +365,22 @@ class RealRun(Simulation):
         """The world stays as it is."""
 
     async def begin(
-        self, options: dict[str, Any], recorder: Recorder | None = None, *, looks: bool = True
-    ) -> GuardedSystem:
+        self,
+        options: dict[str, Any],
+        recorder: Recorder | None = None,
+        *,
+        looks: bool = True,
+        notes: bool = False,
+        own: Collection[str] = ("system",),
+    ) -> None:
+        if "fleet" in own:
+            raise SkipTest("a fleet of a test is always simulated: without --holdfast-real")
         if options.get("store") == PATH:
             folder = self._surroundings.enter_context(tempfile.TemporaryDirectory(prefix="holdfast-"))
             options["store"] = f"sqlite:{Path(folder, 'app.db')}"
         system = await self._life.enter_async_context(GuardedSystem(**options))
         self._roots.append(Root(system))
         self._ends.append(watch_turns(system._node, Tracer(self.trace)))
-        return system
 
     async def moment(self, turns: int = 100) -> None:
         """Wait for a drawn number of ticks of the loop."""
@@ -326,44 +394,11 @@ class RealRun(Simulation):
 
 
 def _kill(root: Root) -> None:
-    """Nothing of a root, whose system may only have begun, runs any more; whoever waits for it hears of that."""
-    system, loop = root.system, asyncio.get_running_loop()
-    node = system._node
-    if node is None:
-        return
+    """SIGKILL for the program of a root, whose system may only have begun."""
+    loop = asyncio.get_running_loop()
     assert isinstance(loop, ControlledLoop)
-    root.node, system._body = node, None
-    pool = vars(system).get("_workers")  # None: it did not come so far.
-    if isinstance(pool, SimulatedWorkers):
-        pool.end()
-    LoopMethods.of(type(loop)).actors_killed(loop, node)  # First: what is dropped is collected at once.
-    loop.drop(root)
-    node.threads.close()
-    cells = [] if node.root is None else [node.root]
-    for cell in cells:  # It grows meanwhile.
-        cells += (cell.children or {}).values()
-        cell.state, cell.admit = GONE, admit_gone
-    for ask in node.deadlines.close():
-        if ask.sender is None:
-            ask.fail(AskFailed(ask.to.path, "the root was killed"))
-            if isinstance(ask.future, asyncio.Future):
-                ask.future.exception()  # A client that waits no more need not see it.
-    for task in asyncio.all_tasks():
-        waiter = waiter_of(task)
-        if waiter is not None and not waiter.done() and _is_called_by(task, system, node):
-            waiter.set_exception(AskFailed(f"/{node.name}", "the root was killed"))
-    system._running = system._root = None  # It is not running.
-
-
-def _is_called_by(task: asyncio.Task[Any], system: GuardedSystem, node: Node) -> bool:
-    """Whether a task waits within a call of a system or of a ref to one of its actors, such as `send`."""
-    coro: Any = task.get_coro()
-    while inspect.iscoroutine(coro):
-        called = coro.cr_frame.f_locals.get("self") if coro.cr_frame is not None else None
-        if called is system or (isinstance(called, ActorRef) and called._cell.node is node):
-            return True
-        coro = coro.cr_await
-    return False
+    root.halt(loop)
+    root.bury()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -379,8 +414,9 @@ class SimulationSettings:
     replay: str | None = None
     strategy: str = "mixed"
     depth: int = DEPTH
-    latency: float | Seconds = 0.0
-    sync: float | Seconds = 0.0
+    holds: int | None = None
+    latency: Said = 0.0
+    sync: Latency = 0.0
     ticks: int = TICKS
     options: dict[str, Any] = dataclasses.field(default_factory=dict)
 
@@ -389,9 +425,8 @@ class SimulationSettings:
             raise ValueError(f"simulate takes one seed or more, not seeds={self.seeds}")
         if self.ticks < 1:
             raise ValueError(f"simulate takes one tick or more, not ticks={self.ticks}")
-        strategy_of(self.strategy, self.depth)
-        _seconds("latency", self.latency)
-        _seconds("sync", self.sync)
+        strategy_of(self.strategy, self.depth, self.holds)
+        said_latencies(self.latency, self.sync)
         if self.replay is not None:
             from_text(parted(self.replay)[0])
 
@@ -422,7 +457,9 @@ class SimulationSettings:
         if not inspect.iscoroutinefunction(test):
             raise TypeError(f"@simulate takes an `async def` test, not {test!r}")
         wanted = inspect.signature(test).parameters
-        own = {name for name in ("system", "faults", "simulation") if name in wanted}
+        own = {name for name in ("system", "fleet", "faults", "simulation") if name in wanted}
+        if "fleet" in own and self.strategy == "exhaustive":
+            raise SpecError("simulate", "strategy='exhaustive' is for actors of one system, and the test has a fleet")
         signature = inspect.Signature([parameter for name, parameter in wanted.items() if name not in own])
 
         @functools.wraps(test)
@@ -459,16 +496,18 @@ def simulate(
     replay: str | None = None,
     strategy: str = "mixed",
     depth: int = DEPTH,
-    latency: float | Seconds = 0.0,
-    sync: float | Seconds = 0.0,
+    holds: int | None = None,
+    latency: Said = 0.0,
+    sync: Latency = 0.0,
     ticks: int = TICKS,
     **options: Any,
 ) -> Any:
     """Run an async test under many schedules, each on a virtual clock with a system of its own.
 
-    The test takes `system` (a running GuardedSystem) and, if it names them, `faults` (the seed's `Faults`) and
-    `simulation`. Whatever else it takes are fixtures; they are made once, for all seeds, and must not be async. What
-    the marker `holdfast` says holds for each seed. `@given` may stand above: each example runs under all seeds.
+    The test takes `system` (a running GuardedSystem), or `fleet` (a GuardedFleet: programs on simulated servers), or
+    both, and, if it names them, `faults` (the seed's `Faults`) and `simulation`. Whatever else it takes are fixtures;
+    they are made once, for all seeds, and must not be async. What the marker `holdfast` says holds for each seed.
+    `@given` may stand above: each example runs under all seeds.
 
     A test is run more often than there are seeds: some runs are made twice, and a failing one is repeated while it is
     shrunk. What it leaves in its surroundings must not change the next run.
@@ -482,8 +521,13 @@ def simulate(
         replay: only this schedule, as a failure has printed it. The option --holdfast-replay FILE says the same.
         strategy: mixed, random, pct, exhaustive, coverage.
         depth: of PCT: how many events have to come in one order for the bug to show.
-        latency: seconds that what an actor's process and the root write to each other takes; (least, longest): drawn.
-        sync: seconds that a sync of the simulated store takes; (least, longest): drawn.
+        holds: of `exhaustive`: every schedule in which at most so many times somebody is held up until nobody else
+            could run, fewest first; None: every schedule. What it has covered is printed.
+        latency: seconds that what an actor's process and the root write to each other takes: a number, (least,
+            longest), a distribution of `holdfast.testing.latencies`, or a function that draws them from a
+            `random.Random`. `{"starts": ..., "reads": ...}`: each by what takes it: frames, starts, reads, writes,
+            syncs, replies, timers.
+        sync: as `latency={"syncs": ...}`: seconds that a sync of the simulated store takes.
         ticks: at one moment of virtual time, after which the run is taken to go on there for ever (`NotIdle`). In a
             tick everything that waited at its beginning has its turn: a burst takes as many as it is deep.
         options: for ActorSystem. `store="simulated"`: a store in memory, which outlives the root (`crash_root`).
@@ -493,15 +537,8 @@ def simulate(
         the same choices differ. UnfitSchedule: a run that was to be repeated passes, and is another. SpecError,
         ValueError, TypeError: the arguments are wrong.
     """
-    settings = SimulationSettings(seeds, seed, replay, strategy, depth, latency, sync, ticks, options)
+    settings = SimulationSettings(seeds, seed, replay, strategy, depth, holds, latency, sync, ticks, options)
     return settings.decorate if test is None else settings.decorate(test)
-
-
-def _seconds(name: str, given: float | Seconds) -> Seconds:
-    least, longest = seconds = given if isinstance(given, tuple) else (given, given)
-    if not 0 <= least <= longest < math.inf:
-        raise SpecError("simulate", f"{name} must be >= 0 seconds, or (least, longest), not {given!r}")
-    return seconds
 
 
 class ScheduleSearch:
@@ -514,15 +551,21 @@ class ScheduleSearch:
     Attributes:
         runs: how many schedules have been tried.
         is_complete: whether there is no other schedule.
+        covered: what has been tried, in words, once an exhaustive search has ended.
     """
 
     def __init__(self, test: Test, own: Iterable[str], settings: SimulationSettings) -> None:
         self.runs = 0
         self.is_complete = False
+        self.covered = ""
         self._test, self._own, self._settings = test, set(own), settings
-        self._strategy, self._named = strategy_of(settings.strategy, settings.depth), settings.strategy
+        self._strategy, self._named = (
+            strategy_of(settings.strategy, settings.depth, settings.holds),
+            settings.strategy,
+        )
         self._wanted = running.get()
         self._failures = self._wanted.failures()
+        self._twice: int = self._wanted.option("twice") or TWICE[self._wanted.option("profile") or "ci"]
 
     def run(self) -> None:
         """Try the schedules that are asked for; those that have failed the last time come first.
@@ -572,16 +615,21 @@ class ScheduleSearch:
                 self._learn(self._run(strategy_of("pct").choices(0) or Choices(0)))
             choices = self._strategy.choices(number)
             if choices is None:
-                self.is_complete = True
-                return
+                break
             self.runs += 1
-            simulation = self._try(choices, looks=number % TWICE == 0)
+            looks, is_twice = number % LOOKS == 0, number % self._twice == 0
+            simulation = self._try(choices, looks=looks, notes=is_twice)
             self._learn(simulation)
-            if number % TWICE == 0:
-                self._check_repeats(simulation)
-        if self._named == "exhaustive" and self._strategy.choices(0) is not None:
-            text = f"{self.runs} schedules were tried, and there are more: raise seeds=, or make the system smaller"
-            warnings.warn(text, NotExhausted, stacklevel=3)
+            if is_twice:
+                self._check_repeats(simulation, looks=looks)
+        if self._named == "exhaustive":
+            self.is_complete, self.covered = self._strategy.choices(0) is None, self._strategy.covered(self.runs)
+            if self.is_complete:
+                print(self.covered)
+            else:
+                bound = "give" if self._settings.holds is None else "lower"
+                text = f"{self.covered}: raise seeds=, {bound} holds=, or make the system smaller"
+                warnings.warn(text, NotExhausted, stacklevel=3)
 
     def _learn(self, simulation: Simulation) -> None:
         self._strategy.learn(simulation.choices, simulation.trace)
@@ -590,7 +638,9 @@ class ScheduleSearch:
         if self._failures is not None:
             self._failures.drop(text)
 
-    def _run(self, choices: Choices, recorder: Recorder | None = None, *, looks: bool = True) -> Simulation:
+    def _run(
+        self, choices: Choices, recorder: Recorder | None = None, *, looks: bool = True, notes: bool = False
+    ) -> Simulation:
         said = self._settings
         return run_schedule(
             self._test,
@@ -599,19 +649,20 @@ class ScheduleSearch:
             said.options,
             recorder,
             looks=looks,
-            latency=_seconds("latency", said.latency),
-            sync=_seconds("sync", said.sync),
+            notes=notes,
+            latency=said.latency,
+            sync=said.sync,
             ticks=said.ticks,
         )
 
-    def _try(self, choices: Choices, *, looks: bool = True) -> Simulation:
+    def _try(self, choices: Choices, *, looks: bool = True, notes: bool = False) -> Simulation:
         """One run; a failure is explained.
 
         Raises:
             whatever the test raises.
         """
         try:
-            return self._run(choices, looks=looks)
+            return self._run(choices, looks=looks, notes=notes)
         except BaseException as error:
             if is_of_time_limit(error):
                 error.add_note(
@@ -634,26 +685,22 @@ class ScheduleSearch:
         first: Simulation = failure.__simulation__  # type: ignore[attr-defined]
         seed, kind = first.seed, _kind(failure)
 
-        def fails(taken: Taken) -> Taken | None:
+        def fails(taken: Taken) -> FailedRun | None:
             try:
                 self._run(repeated(seed, taken))
             except BaseException as error:
                 if not _is_failure(error):
                     raise
                 again: Simulation = error.__simulation__  # type: ignore[attr-defined]
-                return again.choices.kept() if _kind(error) == kind else None
+                return FailedRun(again.choices.kept(), *again.extent()) if _kind(error) == kind else None
             return None
 
         taken = first.choices.kept()
         recorder = Recorder()
         if fails(taken) is None:
-            try:
-                again = self._run(repeated(seed, taken), recorder)
-            except BaseException as error:
-                if not _is_failure(error):
-                    raise
-                again = error.__simulation__  # type: ignore[attr-defined]
-            difference = _difference(first, again) or f"the run of seed {seed} fails only sometimes"
+            again, more = self._failed(seed, taken, recorder), self._failed(seed, taken)
+            found = _difference(first, again) or _difference(again, more)
+            difference = found or f"the run of seed {seed} fails only sometimes"
             note = "\n".join([_head(seed, None, self._is_of_seed()), *hash_seed_in_words(), str(difference)])
             for line in (note, *self._record(failure, as_text(seed, taken), recorder, note)):
                 failure.add_note(line)
@@ -672,6 +719,16 @@ class ScheduleSearch:
         last: Simulation = shown.__simulation__  # type: ignore[attr-defined]
         shown.add_note(self._note(shown, last, taken, recorder))
         return shown
+
+    def _failed(self, seed: int, taken: Taken, recorder: Recorder | None = None) -> Simulation:
+        """The run of this schedule, with the values of what is handled, whether it fails or not."""
+        try:
+            return self._run(repeated(seed, taken), recorder, notes=True)
+        except BaseException as error:
+            if not _is_failure(error):
+                raise
+            made: Simulation = error.__simulation__  # type: ignore[attr-defined]
+            return made
 
     def _translated(self, seed: int, taken: Taken) -> Taken:
         """The same run, kept by who is held up in it."""
@@ -699,7 +756,7 @@ class ScheduleSearch:
         )
         lines += [f"struck: {strike}" for strike in simulation.faults.strikes]
         lines += [f"not the seed's: {what}" for what in simulation.escaped]
-        chart = chart_as_text(recorder.rows)
+        chart = chart_as_text(leading(recorder, failure), recorder.rows)
         if chart:
             lines.append(chart)
         if self._failures is not None:
@@ -711,14 +768,14 @@ class ScheduleSearch:
         folder = None if self._failures is None else self._failures.folder()
         return [] if folder is None else _written(folder, failure, text, recorder, note, self._wanted.nodeid)
 
-    def _check_repeats(self, simulation: Simulation) -> None:
+    def _check_repeats(self, simulation: Simulation, *, looks: bool) -> None:
         """Make a run again by its choices.
 
         Raises:
             NotRepeatable: it went another way.
         """
         try:
-            again = self._run(repeated(simulation.seed, simulation.choices.kept()))
+            again = self._run(repeated(simulation.seed, simulation.choices.kept()), looks=looks, notes=True)
         except BaseException as error:
             if not _is_failure(error):
                 raise
@@ -748,7 +805,8 @@ def _written(folder: Path, failure: BaseException, text: str, recorder: Recorder
     (folder / "failure.txt").write_text("\n".join(said) + "\n", encoding="utf-8")
     schedule, chart = folder / "schedule.txt", folder / "chart.html"
     schedule.write_text(with_hash_seed(text) + "\n", encoding="utf-8")
-    chart.write_text(chart_as_html(recorder.rows, nodeid, note), encoding="utf-8")
+    page = chart_as_html(leading(recorder, failure), recorder.rows, nodeid, note)
+    chart.write_text(page, encoding="utf-8")
     return [
         f"all of it as a chart: {chart}",
         f"repeat it: {before_command()}pytest --holdfast-replay {schedule} '{nodeid}'",
@@ -796,15 +854,18 @@ _ASYNCIO = os.path.join(os.path.dirname(asyncio.__file__), "")
 
 def _difference(first: Simulation, again: Simulation) -> NotRepeatable | None:
     """Where two runs by the same choices went different ways; None: nowhere."""
+    escaped = tuple(dict.fromkeys([*first.escaped, *again.escaped]))
+    parts = parting(first.handled, again.handled)
+    if parts is not None and parts[0].is_same_kind(parts[1]):
+        where, one, other = parts[0].differs(parts[1])
+        return NotRepeatable(first.seed, parts[0].turn, one, other, escaped, f"{where} of {parts[0]}")
     ended = ("", "the end of the run")
-    longest = max(len(first.trace), len(again.trace))
-    for number in range(longest):
-        one = first.trace[number] if number < len(first.trace) else ended
-        other = again.trace[number] if number < len(again.trace) else ended
-        if one != other:
-            escaped = tuple(dict.fromkeys([*first.escaped, *again.escaped]))
-            return NotRepeatable(first.seed, number + 1, " ".join(one).strip(), " ".join(other).strip(), escaped)
-    return None
+    for number in range(max(len(first.trace), len(again.trace))):
+        turn = first.trace[number] if number < len(first.trace) else ended
+        then = again.trace[number] if number < len(again.trace) else ended
+        if turn != then:
+            return NotRepeatable(first.seed, number + 1, " ".join(turn).strip(), " ".join(then).strip(), escaped)
+    return None if parts is None else NotRepeatable(first.seed, parts[0].turn, str(parts[0]), str(parts[1]), escaped)
 
 
 def _in_hypothesis() -> bool:
@@ -829,8 +890,9 @@ def run_schedule(
     recorder: Recorder | None = None,
     *,
     looks: bool = True,
-    latency: Seconds = (0.0, 0.0),
-    sync: Seconds = (0.0, 0.0),
+    notes: bool = False,
+    latency: Said = 0.0,
+    sync: Latency = 0.0,
     ticks: int = TICKS,
 ) -> Simulation:
     """One run under one schedule. Returns what happened.
@@ -839,6 +901,7 @@ def run_schedule(
         recorder: draws up what happens.
         latency, sync, ticks: as `simulate` says.
         looks: whether each message is looked at, as `GuardedSystem` does: that takes most of the time of a run.
+        notes: whether the values of messages and replies are noted, to be compared with those of another run.
 
     Raises:
         whatever the test raises; `error.__simulation__` is the run.
@@ -849,7 +912,7 @@ def run_schedule(
             loop = runner.get_loop()
             assert isinstance(loop, ControlledLoop)
             with TimeLimit(loop):
-                runner.run(_run(test, simulation, own, options, recorder, looks))
+                runner.run(_run(test, simulation, own, options, recorder, looks, notes))
     except BaseException as error:
         error.__simulation__ = simulation  # type: ignore[attr-defined]
         raise
@@ -868,7 +931,7 @@ def run_real(test: Test, own: set[str], options: dict[str, Any], seeds: range | 
         simulation = RealRun(Choices(seed))
         try:
             with asyncio.Runner() as runner:
-                runner.run(_run(test, simulation, own, options, None, looks=True))
+                runner.run(_run(test, simulation, own, options, None, looks=True, notes=False))
         except Exception as error:
             error.add_note(
                 f"seed={seed}, on a real loop (--holdfast-real): its faults are the seed's, and nothing else"
@@ -877,7 +940,13 @@ def run_real(test: Test, own: set[str], options: dict[str, Any], seeds: range | 
 
 
 async def _run(
-    test: Any, simulation: Simulation, own: set[str], options: dict[str, Any], recorder: Recorder | None, looks: bool
+    test: Any,
+    simulation: Simulation,
+    own: set[str],
+    options: dict[str, Any],
+    recorder: Recorder | None,
+    looks: bool,
+    notes: bool,
 ) -> None:
     wanted, faults = running.get(), simulation.faults
     leaks, unseen = LoopLeaks(wanted.leaks), list[str]()
@@ -885,10 +954,15 @@ async def _run(
     simulation.enter(asyncio.get_running_loop(), names_of(test))
     try:
         try:
-            system = await simulation.begin(options, recorder, looks=looks)
-            wanted.tell(system)
+            await simulation.begin(options, recorder, looks=looks, notes=notes, own=own)
+            given: dict[str, Any] = {"faults": faults, "simulation": simulation}
+            if "fleet" in own:
+                given["fleet"] = simulation.fleet
+                wanted.tell(simulation.fleet.expected)
+            if "system" in own or "fleet" not in own:
+                given["system"] = simulation.system
+                wanted.tell(simulation.system)
             try:
-                given = {"system": system, "faults": faults, "simulation": simulation}
                 try:
                     await test(**{name: given[name] for name in own})
                     unseen = leaks.unseen(simulation.asks())

@@ -132,7 +132,10 @@ class Clock:
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
         begin, has_own = time.time() - loop.time(), isinstance(loop, TellsUnixTime)
+        self.machine: Callable[[], float] = loop.time if has_own else monotonic
+        """Seconds on the clock that all processes of the system read."""
         self.is_monotonic = not has_own and abs(monotonic() - loop.time()) < SAME_CLOCK  # the loop has the machine's
+        self._is_machines = self.is_monotonic or has_own  # deadlines of the loop are on the clock that all read
         self.wall: Callable[[], float] = lambda: begin + loop.time()
         if isinstance(loop, TellsUnixTime):
             self.wall = loop.unix_time
@@ -150,7 +153,7 @@ class Clock:
 
     def on_machine(self, deadline: float) -> float:
         """A deadline of the loop's, on the clock that all processes of the machine read."""
-        return deadline if self.is_monotonic else monotonic() + deadline - self._loop.time()
+        return deadline if self._is_machines else monotonic() + deadline - self._loop.time()
 
 
 TOKENS = 1 << 16

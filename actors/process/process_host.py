@@ -10,7 +10,6 @@ import asyncio
 import contextlib
 from collections import deque
 from collections.abc import Callable, Iterable
-from time import monotonic
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
@@ -390,7 +389,7 @@ class FlightHome(WorkerHome):
         if outlet is None or outlet.worker is None:
             return True
         page = outlet.worker.page
-        return ask.started <= max(page[0], page[1]) or monotonic() < ask.deadline
+        return ask.started <= max(page[0], page[1]) or not cell.node.clock.is_past(ask.deadline)
 
     def backlog(self, cell: Cell, running: int) -> int:
         queued = sum(map(mailbox.counts, cell.queue or ()))

@@ -14,7 +14,6 @@ from __future__ import annotations
 import math
 import sys
 from hashlib import blake2b
-from time import monotonic
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
 
 import msgspec
@@ -323,10 +322,10 @@ class FarMail:
         return mail is not None and mail.is_system
 
     def begin(self, which: FarId, until: float) -> None:
-        """It is on its way to its receiver, and nobody waits for it after `until`, on the monotonic clock."""
+        """It is on its way to its receiver, and nobody waits for it after `until`, on the machine's clock."""
         self._open[which] = until
         if len(self._open) % TIDIED == 0:  # Those that have run out in a mailbox have no outcome.
-            now = monotonic()
+            now = self._homes.node.clock.machine()
             self._open = {one: until for one, until in self._open.items() if until > now}
 
     def is_open(self, which: FarId) -> bool:

@@ -12,7 +12,6 @@ import math
 import secrets
 import weakref
 from collections.abc import Callable, Iterator, Sequence
-from time import monotonic
 from typing import TYPE_CHECKING, Any, Final, Protocol, cast
 
 import msgspec
@@ -140,7 +139,7 @@ class LineConnection:
             BadMessage: its payload cannot be coded or is too large; nothing is sent.
         """
         if isinstance(frame, frames.Ask):
-            frame.until -= monotonic()  # The machines have no clock in common: what goes over is what is left.
+            frame.until -= self._far.node.clock.machine()  # Two machines have none in common: what is left goes over.
         try:
             data = self._encode(frame)
         except Exception as error:  # Whatever a payload raises while it is encoded means that it cannot be.
@@ -221,7 +220,7 @@ class FarAsk(RejoinedAsk, eq=False):
     @classmethod
     def arrived(cls, frame: frames.Ask, asker: Cell, cell: Cell, homes: Homes, run: int) -> FarAsk:
         """The ask in a frame; its message is decoded behind it."""
-        left = frame.until - monotonic()
+        left = frame.until - homes.node.clock.machine()
         ask = cls(None, asker, frame.chain, left, homes.node.loop.time() + left, None, cell)
         ask.future, ask.until, ask.homes = ask, frame.until, homes
         ask.asker, ask.turn, ask.k = asker.path, frame.id, run
@@ -467,7 +466,7 @@ class FarLine(Peer):
 
     def _ask_frame(self, key: int, ask: Ask) -> bytes:
         """The frame of an ask under this number."""
-        until = self.node.clock.on_machine(ask.deadline) - monotonic()
+        until = self.node.clock.on_machine(ask.deadline) - self.node.clock.machine()
         name, body = self._payload(ask.message)
         sender = None if ask.sender is None else ask.sender.path
         kind = TOLD if isinstance(ask, KeptTell) else ASKED if isinstance(ask, SwitchAsk) else PASSING
@@ -702,7 +701,7 @@ class FarLine(Peer):
 
     def _take_ask(self, frame: frames.Ask, again: bool) -> None:
         left = frame.until
-        frame.until += monotonic()
+        frame.until += self.node.clock.machine()
         if frame.number != TOLD:  # What is kept there is not refused: it waits.
             problem = self._too_many_asks(frame, left)
             if problem:

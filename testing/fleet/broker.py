@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import asyncio
 import copy
-import random
 from collections.abc import Callable, Sequence
+from contextvars import Context
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from ...cluster.ports import LogRecord, OutOfTurn
+from ..schedules.choices import Choices, Dice
 
 PATH: Final = "sim:broker"
 """What errors call a simulated engine."""
@@ -51,6 +52,8 @@ LAG: Final = 2.0
 """Seconds by which a stale answer is behind at most."""
 LATE: Final = 8.0
 """Seconds by which a request is late at most."""
+LATENCY: Final = (0.0002, 0.003)
+"""Seconds that a message between two machines takes, at least and at most, unless a test says otherwise."""
 
 
 class _Kept(NamedTuple):
@@ -69,17 +72,24 @@ class SimBroker:
         blobs: the large values, by name.
         lease_holder, lease_token: who has the lease, and its token.
         on_request: told of every request that arrives, by its number, before it is done.
+        latency: seconds that a message takes, at least and at most; may be changed, too.
 
     Args:
         seed: decides all that is drawn.
         faults: how often what goes wrong.
-        latency: seconds that a message takes, at least and at most.
+        choices: of a simulated run: keeps what is drawn.
     """
 
     def __init__(
-        self, seed: int = 0, faults: BrokerFaults = NO_FAULTS, *, latency: tuple[float, float] = (0.0002, 0.003)
+        self,
+        seed: int = 0,
+        faults: BrokerFaults = NO_FAULTS,
+        *,
+        latency: tuple[float, float] = LATENCY,
+        choices: Choices | None = None,
     ) -> None:
-        self.draw = random.Random(f"broker {seed}")
+        self.dice = Dice("broker", seed, choices)
+        self._nowhere = Context()  # What is on its way arrives, whatever becomes of the program that has sent it.
         self.faults, self.latency = faults, latency
         self.blobs: dict[str, bytes] = {}
         self.lease_holder, self.lease_token = "", 0
@@ -90,22 +100,18 @@ class SimBroker:
         self._last, self._begins = 0, 0
         self._away_until = 0.0
         self._elections = 0
-        self._waiting: set[asyncio.Future[None]] = set()
+        self._waiting: dict[asyncio.Future[None], None] = {}
 
     def copy(self) -> SimBroker:
         """The same servers as they are now, with all that they have, for other programs; nobody has the lease."""
         made = SimBroker(0, latency=self.latency)
-        made.draw = copy.copy(self.draw)
+        made.dice = copy.deepcopy(self.dice)
         made.blobs = self.blobs.copy()
         made._log, made._last, made._begins = self._log.copy(), self._last, self._begins
         made.lease_token = self.lease_token
         return made
 
     # -- what happens to them ---------------------------------------------------------------------------------------
-
-    def strikes(self, share: float) -> bool:
-        """Draw whether something goes wrong of which this share does."""
-        return share > 0.0 and self.draw.random() < share
 
     def arrived(self) -> None:
         """Take note that a request has arrived at the servers."""
@@ -114,7 +120,11 @@ class SimBroker:
 
     def one_way(self) -> float:
         """Draw how many seconds a message takes."""
-        return self.draw.uniform(*self.latency)
+        return self.dice.seconds(*self.latency)
+
+    def later(self, seconds: float, call: Callable[..., None], *args: object) -> None:
+        """Have something happen between a program and the servers, or to these, so many seconds later."""
+        asyncio.get_running_loop().call_later(seconds, call, *args, context=self._nowhere)
 
     def go_away(self, seconds: float) -> None:
         """Have nobody answer for so many seconds: an election, or an outage. Readers may fall silent for good."""
@@ -138,9 +148,9 @@ class SimBroker:
 
     def append(self, data: bytes, after: int) -> int:
         """Append a record behind the last one; see `Log`."""
-        if after != self._last or self.strikes(self.faults.refused):
+        if after != self._last or self.dice.strikes(self.faults.refused):
             raise OutOfTurn(after)
-        self._last += 1 + self.strikes(0.1)  # Numbers may have gaps.
+        self._last += 1 + (self.dice.random.random() < 0.1)  # Numbers may have gaps.
         self._log.append(_Kept(LogRecord(self._last, data), _now(), self._begins))
         for one in self._waiting:
             if not one.done():
@@ -165,11 +175,11 @@ class SimBroker:
     async def grown(self, seconds: float) -> None:
         """Wait for a record, for so many seconds at most."""
         waiter: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._waiting.add(waiter)
+        self._waiting[waiter] = None
         try:
             await asyncio.wait([waiter], timeout=seconds)
         finally:
-            self._waiting.discard(waiter)
+            self._waiting.pop(waiter, None)
 
     @property
     def records(self) -> Sequence[LogRecord]:
@@ -194,7 +204,7 @@ class SimBroker:
         if self.held_by() not in ("", holder):
             return None
         self.lease_holder, self.lease_token = holder, self.lease_token + 1
-        self._lease_until = _now() + seconds * (1 + self.faults.skew * self.draw.uniform(-1, 1))
+        self._lease_until = _now() + seconds * (1 + self.faults.skew * self.dice.random.uniform(-1, 1))
         return self.lease_token
 
     def release_lease(self, token: int) -> None:

@@ -24,9 +24,11 @@ class SimLink:
         sends: whether requests arrive.
         hears: whether answers do.
         stale_since: a server that is cut off with the program answers reads as of then; `None`: there is none.
+        is_struck: asked at each request whether it is lost, with all that follows from that.
     """
 
     def __init__(self) -> None:
+        self.is_struck: Callable[[], bool] = bool
         self.sends = self.hears = True
         self.stale_since: float | None = None
         self._goes_on = asyncio.Event()
@@ -92,7 +94,7 @@ class _Asks:
         Raises:
             OutOfTurn: `do` does. Unanswered: nobody knows whether it was done.
         """
-        broker, link, faults = self.broker, self.link, self.broker.faults
+        broker, link, faults, dice = self.broker, self.link, self.broker.faults, self.broker.dice
         loop = asyncio.get_running_loop()
         answer: asyncio.Future[T] = loop.create_future()
         await link.awake()
@@ -106,7 +108,7 @@ class _Asks:
             except OutOfTurn as error:
                 result = error
             if is_heard:
-                loop.call_later(broker.one_way(), hear, result)
+                broker.later(broker.one_way(), hear, result)
 
         def hear(result: T | OutOfTurn) -> None:
             if answer.done() or not link.hears or broker.is_away():
@@ -117,18 +119,20 @@ class _Asks:
                 answer.set_result(result)
 
         if read is not None:
-            is_stale = broker.strikes(faults.stale)
-            as_of = loop.time() - broker.draw.uniform(0, LAG) if is_stale else loop.time()
+            is_stale = dice.strikes(faults.stale)
+            as_of = loop.time() - dice.seconds(0.0, LAG) if is_stale else loop.time()
             if link.stale_since is not None:
-                loop.call_later(broker.one_way(), _set, answer, read(min(as_of, link.stale_since)))
+                broker.later(broker.one_way(), _set, answer, read(min(as_of, link.stale_since)))
             elif is_stale:
                 do = partial(read, as_of)
-        if broker.strikes(faults.late_requests):
-            loop.call_later(ANSWER_SECONDS + broker.draw.uniform(0, LATE), arrive, False)
-        elif not broker.strikes(faults.lost_requests):
-            loop.call_later(broker.one_way(), arrive, not broker.strikes(faults.lost_answers))
-            if broker.strikes(faults.doubled):
-                loop.call_later(broker.draw.uniform(0, LATE), arrive, False)
+        if link.is_struck():
+            pass
+        elif dice.strikes(faults.late_requests):
+            broker.later(ANSWER_SECONDS + dice.seconds(0.0, LATE), arrive, False)
+        elif not dice.strikes(faults.lost_requests):
+            broker.later(broker.one_way(), arrive, not dice.strikes(faults.lost_answers))
+            if dice.strikes(faults.doubled):
+                broker.later(dice.seconds(0.0, LATE), arrive, False)
         await asyncio.wait([answer], timeout=ANSWER_SECONDS)
         await link.awake()
         if not answer.done():
@@ -182,24 +186,25 @@ class SimReader:
         """The next records; see `LogReader`."""
         loop, broker, link = asyncio.get_running_loop(), self._broker, self._asks.link
         until = loop.time() + seconds
-        lag = broker.draw.uniform(0, LAG) if broker.strikes(broker.faults.stale) else 0.0
+        dice, faults = broker.dice, broker.faults
+        lag = dice.seconds(0.0, LAG) if dice.strikes(faults.stale) else 0.0
         if broker.elections > self._elections:
             self._elections = broker.elections
-            self._is_silent |= broker.draw.random() < 0.5
-        self._is_silent |= broker.strikes(broker.faults.silent)
+            self._is_silent |= dice.strikes(0.5)
+        self._is_silent |= dice.strikes(faults.silent)
         await asyncio.sleep(min(broker.one_way(), seconds))
         while (left := until - loop.time()) > 0:
             if self._is_silent or not link.sends or not link.hears or broker.is_away():
                 await asyncio.sleep(left)
-                if not self._is_silent and broker.draw.random() < 0.5:
+                if not self._is_silent and dice.strikes(0.5):
                     raise Unanswered(PATH, "the reader's server is gone")
                 return []
             found = broker.view(self._at, loop.time() - lag)[:BATCH]
             if not found:
                 await broker.grown(left if lag == 0 else min(left, lag / 2))
                 continue
-            if len(found) > 1 and broker.strikes(broker.faults.skipped):
-                del found[broker.draw.randrange(len(found) - 1)]
+            if len(found) > 1 and dice.strikes(faults.skipped):
+                del found[dice.random.randrange(len(found) - 1)]
             self._at = found[-1].sequence
             await asyncio.sleep(broker.one_way())
             await link.awake()

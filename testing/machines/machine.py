@@ -15,6 +15,7 @@ from typing import Any, ClassVar, TypeVar
 try:
     from hypothesis import note
     from hypothesis.control import current_build_context, currently_in_test_context
+    from hypothesis.errors import HypothesisException
     from hypothesis.stateful import RuleBasedStateMachine, rule
 except ImportError as error:
     raise ImportError(
@@ -27,22 +28,26 @@ from ...actors.kernel.message import Message
 from ...actors.kernel.ref import DEFAULT_TIMEOUT, ActorRef
 from ...supervision.spec import ChildSpec
 from ..barrier import idle
+from ..charts.causes import leading
+from ..charts.chart_recorder import Recorder
+from ..charts.chart_text import as_text as chart_as_text
 from ..clock import advance
 from ..faults import Faults, Strikes
 from ..guard.loop_leaks import LoopLeaks
 from ..guarded import GuardedSystem, UnexpectedEnd
 from ..histories.checker import linearizable
 from ..histories.history import History, Model
+from ..latencies import Said
 from ..schedules.bound_names import names_of
-from ..schedules.charts import Recorder
-from ..schedules.charts import as_text as chart_as_text
 from ..schedules.choices import ROUNDS, Choices, Production, as_text, from_text, repeated, require_fit
 from ..schedules.control import ControlledLoop
 from ..schedules.processes import SimulatedWorker
+from ..schedules.time_limits import is_of_time_limit
 from ..schedules.world import World
 from ..simulation import Simulation
 from ..wanted import running
 from .drawn import PAUSES, Drawn
+from .shrink_time import ShrinkTime
 
 A = TypeVar("A", bound=Actor)
 R = TypeVar("R")
@@ -50,7 +55,7 @@ T = TypeVar("T")
 
 OPTIONS: Mapping[str, Any] = {"intensity": 100}
 """Crashes are what a machine does: those of its rules do not end the tree, but an actor that crashes for ever does."""
-MEANT_FOR_SUBCLASSES = frozenset({"set_up", "teardown", "model", "options", "latency"})
+MEANT_FOR_SUBCLASSES = frozenset({"set_up", "teardown", "model", "options", "latency", "shrink_seconds"})
 
 
 class ActorMachine(RuleBasedStateMachine):
@@ -67,7 +72,9 @@ class ActorMachine(RuleBasedStateMachine):
     Attributes:
         model: what the history has to obey; None: it is not judged.
         options: for ActorSystem. By default its root allows 100 restarts within its period.
-        latency: of processes, as `simulate` takes it.
+        latency: as `simulate` takes it.
+        shrink_seconds: real seconds, >= 0, for which Hypothesis looks for a simpler example when one has failed.
+            What is shown says if that was cut short.
         system: the running system; `system.expect_crashes()` and the like say what is meant to happen.
         history: of all that was asked and told through the machine.
         faults: what `inject` injects.
@@ -75,7 +82,10 @@ class ActorMachine(RuleBasedStateMachine):
 
     model: ClassVar[Model[Any] | None] = None
     options: ClassVar[Mapping[str, Any]] = {}
-    latency: ClassVar[float | tuple[float, float]] = 0.0
+    latency: ClassVar[Said] = 0.0
+    shrink_seconds: ClassVar[float] = 30.0
+
+    _shrinking: ClassVar[ShrinkTime] = ShrinkTime()
 
     system: GuardedSystem
     history: History
@@ -85,10 +95,9 @@ class ActorMachine(RuleBasedStateMachine):
         super().__init__()
         self._is_drawn, self._schedule = schedule is None and currently_in_test_context(), schedule
         choices = self._choices_of(schedule)
-        late = self.latency if isinstance(self.latency, tuple) else (self.latency, self.latency)
         self.history = History()
         self._options: dict[str, Any] = {"seed": choices.seed, **OPTIONS, **running.get().options, **self.options}
-        self._simulation = Simulation(choices, late)
+        self._simulation = Simulation(choices, type(self).latency)
         self.faults = self._simulation.faults
         self._choices = choices
         self._recorder = Recorder() if self._is_drawn and current_build_context().is_final else None
@@ -113,6 +122,8 @@ class ActorMachine(RuleBasedStateMachine):
         for name in vars(cls):
             if not name.startswith("_") and name in vars(ActorMachine) and name not in MEANT_FOR_SUBCLASSES:
                 raise TypeError(f"{cls.__name__}.{name} would hide ActorMachine.{name}: give it another name")
+        if not cls.shrink_seconds >= 0:
+            raise ValueError(f"{cls.__name__}.shrink_seconds must be >= 0 seconds, not {cls.shrink_seconds!r}")
 
     def _choices_of(self, schedule: str | None) -> Choices:
         if schedule is not None:
@@ -122,7 +133,8 @@ class ActorMachine(RuleBasedStateMachine):
     async def _begin(self) -> None:
         wanted = running.get()
         self._leaks = LoopLeaks(wanted.leaks)
-        self.system = await self._simulation.begin(self._options, self._recorder)
+        await self._simulation.begin(self._options, self._recorder)
+        self.system = self._simulation.system
         wanted.tell(self.system)
 
     def set_up(self) -> None:
@@ -284,7 +296,7 @@ class ActorMachine(RuleBasedStateMachine):
         finally:
             problems = self._end()
             if has_failed:
-                self._note()
+                self._note(sys.exc_info()[1] or failure)
         try:
             if problems and not has_failed:
                 raise UnexpectedEnd(tuple(problems))
@@ -292,8 +304,8 @@ class ActorMachine(RuleBasedStateMachine):
                 linearizable(self.history, self.model).verify()
             if self._schedule is not None and not has_failed:
                 require_fit(self._schedule, self._choices)
-        except BaseException:
-            self._note()
+        except BaseException as error:
+            self._note(error)
             raise
 
     async def _outcomes(self) -> None:
@@ -329,12 +341,21 @@ class ActorMachine(RuleBasedStateMachine):
         finally:
             self._leaks.close()
 
-    def _note(self) -> None:
+    def _note(self, failure: BaseException | None) -> None:
         """Print how the example went, if it is the one that Hypothesis shows."""
-        if self._recorder is None:
+        if self._recorder is None or failure is None:
+            if self._is_drawn and _is_failure(failure):
+                self._shrinking.begin(self.shrink_seconds)
             return
+        if self._shrinking.end():
+            note(f"shrinking was cut short after {self.shrink_seconds:g} s (`shrink_seconds`)")
         text = as_text(self._choices.seed, self._choices.kept())
         note(f'repeat it outside of Hypothesis with {type(self).__name__}(schedule="{text}")')
-        chart = chart_as_text(self._recorder.rows)
+        chart = chart_as_text(leading(self._recorder, failure), self._recorder.rows)
         if chart:
             note(chart)
+
+
+def _is_failure(error: BaseException | None) -> bool:
+    """Whether an example has failed: Hypothesis ends one that it does not want by an error, too."""
+    return isinstance(error, Exception) and not isinstance(error, HypothesisException) and not is_of_time_limit(error)

@@ -26,29 +26,40 @@ PATIENCE: Final = 1000
 """Choices after which nobody is held up any more: whoever runs may be waiting for them."""
 FAULT: Final = "fault"
 DELAY: Final = "delay"
+"""How long a fault lasts."""
+LATENCY: Final = "latency"
+"""How long what is written takes until it arrives, or is safe."""
 MOMENT: Final = "moment"
 """After how many turns something happens that the test does."""
 LOSS: Final = "loss"
 """How many of the writes that were not synced a power cut takes."""
 ROUNDS: Final = "rounds"
 """How long the system goes on after a step of a machine."""
-KINDS: Final = (TURN, HOLD, FAULT, DELAY, MOMENT, LOSS, ROUNDS)
+KINDS: Final = (TURN, HOLD, FAULT, DELAY, LATENCY, MOMENT, LOSS, ROUNDS)
 LEVELS: Final = 64
 """So many different delays can be drawn of one range."""
 
 
 class NotRepeatable(HoldfastError, AssertionError):
-    """The same choices gave another run: something decides that no seed has in its hand."""
+    """The same choices gave another run: something decides that no seed has in its hand.
+
+    Attributes:
+        turn: the number of the turn at which they part.
+        first, again: what that was in each.
+        field: of which message or reply a field has another value, if that is what differs.
+    """
 
     seed: int
     turn: int
     first: str
     again: str
     escaped: tuple[str, ...]
+    field: str = ""
 
     def __str__(self) -> str:
+        where = f"in turn {self.turn} {self.field} was" if self.field else f"turn {self.turn} was"
         text = (
-            f"the run of seed {self.seed} cannot be repeated: turn {self.turn} was {self.first}, and the same choices "
+            f"the run of seed {self.seed} cannot be repeated: {where} {self.first}, and the same choices "
             f"then gave {self.again}. Something decides that is not the seed's"
         )
         if self.escaped:
@@ -129,6 +140,39 @@ class Choices:
         """What repeats the run so far."""
         found = {TURN: dict(self.taken), **{kind: dict(drawn) for kind, drawn in self.drawn.items()}}
         return {kind: chosen for kind, chosen in found.items() if chosen}
+
+
+class Dice:
+    """Draws what happens in a run beside its order, by one seed.
+
+    Args:
+        what: the name of what is drawn for.
+        seed: decides it.
+        choices: of a simulated run: keeps what was drawn, and repeats it.
+
+    Attributes:
+        random: for what is not kept.
+    """
+
+    def __init__(self, what: str, seed: int, choices: Choices | None = None) -> None:
+        self.random = random.Random(f"{what} {seed}")
+        self._choices = choices
+
+    def strikes(self, share: float) -> bool:
+        """Draw whether a fault strikes of which this share does."""
+        if share <= 0.0:
+            return False
+        drawn = self.random.random() < share
+        return drawn if self._choices is None else bool(self._choices.draw(FAULT, 2, int(drawn)))
+
+    def seconds(self, least: float, longest: float) -> float:
+        """Draw how long something takes."""
+        if least == longest:
+            return least
+        if self._choices is None:
+            return self.random.uniform(least, longest)
+        level = self._choices.draw(LATENCY, LEVELS, int(self.random.random() * LEVELS))
+        return least + (longest - least) * level / (LEVELS - 1)
 
 
 class Production(Choices):

@@ -20,22 +20,26 @@ from collections.abc import Callable, Hashable, Iterable
 from contextvars import Context
 from typing import TYPE_CHECKING, Any, Final, TypeVar, TypeVarTuple
 
+from ...actors.kernel import lifecycle
 from ...actors.kernel import loop as run_loop
 from ...actors.kernel.cell import Cell
 from ...actors.kernel.node import Node
 from ..clock import TICKS, VirtualClockLoop
+from ..latencies import Latencies, LateReplies, What
 from ..swaps import Swaps
+from .choices import Choices
 from .disk import simulated
 from .due import DueQueue, Option, TellingHandle
-from .footprints import Footprints
 from .livelock import Rounds
 from .numbered import NumberedFuture, NumberedTask
-from .places import SimulatedPlace, inside, is_dead, never, no_more
-from .strategies import Explored
+from .places import SimulatedPlace, inside, is_dead, never, no_more, place_of
+from .reduction.stepped import Stepped
+from .reduction.telling import TellingFuture, TellingTask
+from .reduction.watch import Watch
 from .world import EPOCH
 
 if TYPE_CHECKING:
-    from .choices import Choices, Keys
+    from .choices import Keys
     from .turn_log import TurnLog
 
 T = TypeVar("T")
@@ -90,8 +94,10 @@ class ControlledLoop(VirtualClockLoop):
         self._sent: deque[asyncio.Handle] = deque()  # by threads
         self._work: dict[asyncio.Future[Any], int] = {}  # of anyio's threads, by when it was given
         self._resting: list[asyncio.Future[None]] = []
+        self._is_ending = False
         self._dead: list[Any] = []  # tasks: kept, since what is collected is closed, which runs its code
-        self.sync_seconds: Callable[[], float] = float  # that a sync of a simulated store takes: none
+        self.latencies = Latencies(Choices(0), {})  # none
+        self.late_replies: LateReplies | None = None
 
     async def rest(self) -> None:
         """Wait until nothing else can happen at this moment: one tick more is not enough where others come first."""
@@ -142,6 +148,8 @@ class ControlledLoop(VirtualClockLoop):
         if sent:
             return True
         resting, self._resting = self._resting, []
+        if resting and self.control is not None and self.control.watch is not None:
+            self.control.watch.time_passes()
         for rest in resting:
             if not rest.done():
                 rest.set_result(None)
@@ -172,29 +180,52 @@ class ControlledLoop(VirtualClockLoop):
         self._wake_up()
         return handle
 
+    def call_at(
+        self, when: float, callback: Callable[[*Ts], object], *args: *Ts, context: Context | None = None
+    ) -> asyncio.TimerHandle:
+        """As every loop."""
+        handle = super().call_at(when, callback, *args, context=context)
+        if self.due.watch is not None:
+            self.due.watch.set_timer(handle)
+        return handle
+
     def _wake_up(self) -> None:
         wake: Callable[[], None] = getattr(self, "_write_to_self")  # noqa: B009  # asyncio's own, which no stub has
         wake()
 
     def create_future(self) -> asyncio.Future[Any]:
         """As every loop; the hash of the future is its number."""
-        future: NumberedFuture[Any] = NumberedFuture(loop=self)
+        watch = self.due.watch
+        if watch is None:
+            future: NumberedFuture[Any] = NumberedFuture(loop=self)
+        else:
+            future = TellingFuture(loop=self)
+            future.listener = watch
         future.number = next(self._numbers)
         return future
 
     def create_task(self, coro: Any, **options: Any) -> asyncio.Task[Any]:
         """As every loop; the hash of the task is its number."""
         task: asyncio.Task[Any]
+        if self._is_ending:  # By the `finally` of what was killed: nobody runs it.
+            _close(coro)
+            raise RuntimeError("Event loop is closed")
         if self.get_task_factory() is None:
             if self.is_closed():
                 raise RuntimeError("Event loop is closed")
-            task = NumberedTask(next(self._numbers), coro, loop=self, **options)
+            number, watch = next(self._numbers), self.due.watch
+            if watch is None:
+                task = NumberedTask(number, coro, loop=self, **options)
+            else:
+                task = TellingTask(watch, number, coro, loop=self, **options)
         else:
             task = super().create_task(coro, **options)
         context: Context | None = options.get("context")
         place = inside.get() if context is None else context.get(inside)
         if place is not None:
             place.tasks.add(task)
+            if place.is_dead:  # In the step in which it has died.
+                self._bury(task)
         return task
 
     def run_in_executor(self, executor: Any, func: Callable[[*Ts], T], *args: *Ts) -> asyncio.Future[T]:
@@ -203,13 +234,21 @@ class ControlledLoop(VirtualClockLoop):
         if work is None:
             return super().run_in_executor(executor, func, *args)
         done: asyncio.Future[T] = self.create_future()
-        self.call_later(self.sync_seconds(), _do, done, work)
+        self.call_later(self.latencies.of(work.takes)(), _do, done, work)
         return done
 
-    def add(self, place: SimulatedPlace) -> None:
-        """A place begins to run in this loop."""
-        if self.control is not None:
-            self.control.add(place.node)
+    def hold_up(self, what: What) -> None:
+        """Something is done in the loop that takes time, in which nothing else is done here."""
+        seconds = self.latencies.of(what)()
+        if seconds:
+            self.pass_time(seconds)
+
+    def lateness(self) -> float:
+        return self.latencies.of("timers")() if self.control is not None else 0.0
+
+    def on_their_way(self) -> list[float]:
+        """When each late reply arrives."""
+        return [] if self.late_replies is None else self.late_replies.times()
 
     def drop(self, place: SimulatedPlace) -> None:
         """Nothing of this place runs any more."""
@@ -219,27 +258,29 @@ class ControlledLoop(VirtualClockLoop):
             if is_dead(handle):
                 _close_unbegun(handle)
                 handle.cancel()
-        node = place.node
-        tasks: list[Any] = [*place.tasks, *(runner.task for runner in node._runners)]
+        tasks: list[Any] = [*place.tasks]
+        for node in place.nodes:
+            tasks += (runner.task for runner in node._runners)
+            node.wake = never  # type: ignore[method-assign]
+            node.idle_again = no_more  # type: ignore[method-assign]
+            if self.control is not None:
+                self.control.drop(node)
         for task in tasks:
-            asyncio._unregister_task(task)  # Nobody waits for it, and it cleans nothing up.
-            task._log_destroy_pending = False
-        self._dead += tasks
-        node.wake = never  # type: ignore[method-assign]
-        node.idle_again = no_more  # type: ignore[method-assign]
-        if self.control is not None:
-            self.control.drop(node)
+            self._bury(task)
+
+    def _bury(self, task: Any) -> None:
+        """Nobody waits for a task, and it cleans nothing up."""
+        asyncio._unregister_task(task)
+        task._log_destroy_pending = False
+        self._dead.append(task)
 
     def close(self) -> None:
         """As every loop. What was left of killed processes is collected now: Python runs the `finally` of each then."""
+        self._is_ending = True
         dead, self._dead = self._dead, []
         for task in dead:
             _close(task.get_coro())
         super().close()
-
-    def scheduled_timers(self) -> int:
-        """How many timers there are."""
-        return len(self._scheduled)
 
 
 def _close(coroutine: Any) -> None:
@@ -288,22 +329,24 @@ def _do(done: asyncio.Future[T], work: Callable[[], T]) -> None:
 class Control:
     """Has the choices of one run carried out, from here to `remove`.
 
+    The turns of every node of the loop are chosen, from when its actors have something to do for the first time.
+
     Args:
         choices: what decides.
         log: notes the turns.
-        node: of the root.
+        node: of the system that the test has; None: it has none.
         loop: whose steps are chosen.
-        on_node: called with each node whose turns are chosen.
+        on_node: called with each node whose turns are chosen, and what its place is called.
     """
 
     def __init__(
         self,
         choices: Choices,
         log: TurnLog,
-        node: Node,
+        node: Node | None,
         loop: ControlledLoop,
         *,
-        on_node: Callable[[Node], None] = lambda node: None,
+        on_node: Callable[[Node, str], None] = lambda node, name: None,
     ) -> None:
         self.choices = choices
         self.choose: Callable[[int, Keys], int] = choices.turn  # which of so many goes on
@@ -319,23 +362,36 @@ class Control:
         self._in_a_row = 0  # turns of that one
         self._nodes: dict[object, DrawnCells] = {}
         self._drained: DrawnCells | None = None  # where a turn was begun, after which nothing has been chosen yet
-        self._footprints: Footprints | None = None
-        if isinstance(choices, Explored):
-            self._footprints = choices.footprints = Footprints(node, loop)
+        self.watch: Watch | None = None
+        if isinstance(choices, Stepped) and node is not None:
+            self.watch = loop.due.watch = choices.watch = Watch(choices, node)
+            self._due.is_told = True
         self._swaps = Swaps()
+        if self.watch is not None:
+            self._swaps.put(lifecycle, "build", self.watch.build)
         self._swaps.put(run_loop, "clock", self._clock)
         for name in ("MOST", "STRIDE"):
             self._swaps.put(run_loop, name, 1)
-        self.add(node)
+        if node is not None:
+            self.meet(node)
         loop.control = loop.due.chooser = self
 
-    def add(self, node: Node) -> None:
-        """The turns of this node are chosen, too: the root's, or that of a process."""
+    def meet(self, node: Node) -> None:
+        """The turns of this node are chosen, too, from now on."""
+        if node in self._nodes:
+            return
+        place = place_of(node)
+        name = "" if place is None else place.name
+        if place is not None and node not in place.nodes:
+            place.nodes.append(node)
+        self._log.call(node, name)
         cells = self._nodes[node] = DrawnCells(node.ready, self)
         self._swaps.put(node, "ready", cells)
-        for name in ("most", "stride"):
-            self._swaps.put(node, name, 1)  # One turn, and a look at the clock, which is where the next step is chosen.
-        self._on_node(node)
+        for limit in ("most", "stride"):
+            self._swaps.put(
+                node, limit, 1
+            )  # One turn, and a look at the clock, which is where the next step is chosen.
+        self._on_node(node, name)
 
     def drop(self, node: Node) -> None:
         """Nothing of this node has a turn any more."""
@@ -347,7 +403,7 @@ class Control:
 
     def remove(self) -> None:
         """Let the rest of the run be as in production."""
-        self._loop.control = self._due.chooser = None
+        self._loop.control = self._due.chooser = self._due.watch = None
         self._loop.forget_ticks()  # All that were counted till now were others.
         self._swaps.undo()
         for node, cells in self._nodes.items():
@@ -401,8 +457,8 @@ class Control:
         if self._rounds is not None:
             self._rounds.step(cell)
         self._note(cell)
-        if self._footprints is not None:
-            self._footprints.touch(cell)
+        if self.watch is not None:
+            self.watch.turn(cell)
 
     def _clock(self) -> float:
         """The run loop's measure of its slices: asked before the first turn and after each."""
@@ -436,8 +492,6 @@ class Control:
             chosen = self._chosen(due)
         if self.next_cell is None:
             self._turns = 0
-            if self._footprints is not None:
-                self._footprints.touch(None)
         return chosen
 
     def _chosen(self, due: DueQueue) -> Option:
@@ -466,15 +520,22 @@ class Control:
 
     def called(self, option: Option) -> None:
         """A callback is called; if it is that of a node, its turns tell more."""
-        if self._rounds is not None and type(option[0]) is not Node:
-            self._rounds.step(option[0])
+        if type(option[0]) is not Node:
+            if self._rounds is not None:
+                self._rounds.step(option[0])
+            if self.watch is not None:
+                self.watch.callback(option)
+        elif self.watch is not None and not self._nodes.get(option[0]):
+            self.watch.callback(option)
 
     # -- the moment ---------------------------------------------------------------------------------------------------
 
     def begin_moment(self) -> None:
         """Virtual time has passed."""
-        self._rounds, self._moment, self._due.is_told = None, self._log.turns, False
+        self._rounds, self._moment, self._due.is_told = None, self._log.turns, self.watch is not None
         self.choose = self.choices.turn
+        if self.watch is not None:
+            self.watch.time_passes()
 
     def goes_on_for_ever(self, ticks: int) -> bool:
         """Whether it seems that virtual time will never pass, after so many ticks of the loop at this moment."""

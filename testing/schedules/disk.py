@@ -1,7 +1,8 @@
 """The store of a simulated run: a disk in memory that outlives a killed root, and a power cut as far as it was synced.
 
 What is written is there at once for whoever opens the store next. What was not synced is lost by a power cut, from some
-write on: which one is drawn. A sync takes drawn seconds.
+write on: which one is drawn. What is read or written in the loop holds the loop up for drawn seconds; a sync, and what
+else has a thread in production, takes drawn seconds beside it.
 """
 
 from __future__ import annotations
@@ -15,40 +16,24 @@ from collections.abc import Callable, Collection, Generator, Sequence
 from typing import Any, Final
 
 from ...actors.errors import HoldfastError
+from ...checkpoint.engine_calls import Called
+from ...checkpoint.group_commit import Commits
 from ...checkpoint.journal import DamagedStore, Entry, Saved, StaleEpoch, StoreFailed
 from ...checkpoint.snapshot.shared_blocks import Segment
 from ...checkpoint.turn_word import blamed, is_at_work
 from ...cluster.store_contents import Change, MemoryContents
-from .choices import DELAY, LEVELS, LOSS, Choices
+from ..latencies import What
+from .choices import LOSS, Choices
 
 PATH: Final = "simulated"
 """The name of the store in errors, and in `simulate(store=...)`."""
 
 
-class Latency:
-    """Seconds that something takes, drawn anew each time.
-
-    Args:
-        choices: of the run.
-        what: the name of what takes them.
-        seconds: (least, longest).
-    """
-
-    def __init__(self, choices: Choices, what: str, seconds: tuple[float, float]) -> None:
-        self._choices, self._seconds = choices, seconds
-        self._draw = random.Random(f"{what} {choices.seed}")
-
-    def __call__(self) -> float:
-        """The seconds that it takes this time."""
-        least, longest = self._seconds
-        if least == longest:
-            return least
-        level = self._choices.draw(DELAY, LEVELS, int(self._draw.random() * LEVELS))
-        return least + (longest - least) * level / (LEVELS - 1)
-
-
 class SimulatedDisk:
     """What outlives a root of a simulated run.
+
+    Args:
+        takes: is told of what holds the loop up.
 
     Attributes:
         written: what whoever opens it next finds, unless the power is cut.
@@ -56,7 +41,8 @@ class SimulatedDisk:
         words: by address: which input is in hand.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, takes: Callable[[What], None] = lambda what: None) -> None:
+        self.takes = takes
         self.written = MemoryContents()
         self.epoch = 0
         self.words: dict[str, array[int]] = {}
@@ -145,6 +131,21 @@ class SimulatedJournal:
     def _contents(self) -> MemoryContents:
         return self.disk.written
 
+    @property
+    def _read(self) -> MemoryContents:
+        """What is written, as it is read."""
+        self._take("reads")
+        return self._contents
+
+    def _write(self, change: str, *args: Any) -> None:
+        self._check()
+        self._take("writes")
+        self.disk.write(change, *args)
+
+    def _take(self, what: What) -> None:
+        if self._covers is None:  # Else it is done beside the loop, where it takes its time before.
+            self.disk.takes(what)
+
     def _check(self) -> None:
         if not self._is_open:
             raise StoreFailed(PATH, "it is closed")
@@ -159,12 +160,13 @@ class SimulatedJournal:
                 raise TypeError(f"{entry!r} is no entry")
             _check_entry(entry)
         first = self._contents.last + 1
-        self.disk.write("append", list(entries))
+        self._write("append", list(entries))
         return list(range(first, first + len(entries)))
 
     def sync(self) -> None:
         """See `Journal`."""
         self._check()
+        self._take("syncs")
         self.disk.sync(self.disk.newest() if self._covers is None else self._covers[0])
 
     @contextlib.contextmanager
@@ -178,9 +180,8 @@ class SimulatedJournal:
 
     def cut(self, address: str, snapshot: bytes, drop: Sequence[int] | range, *, turn: int, keep: int = 2) -> None:
         """See `Journal`."""
-        self._check()
         dropped = drop if isinstance(drop, range) else frozenset(drop)
-        self.disk.write("cut", address, bytes(snapshot), dropped, turn, keep)
+        self._write("cut", address, bytes(snapshot), dropped, turn, keep)
 
     @contextlib.contextmanager
     def together(self) -> Generator[None, None, None]:
@@ -191,25 +192,25 @@ class SimulatedJournal:
 
     def load(self, address: str, *, older: int = False) -> Saved:
         """See `Journal`."""
-        found, entries = self._contents.load(address, int(older))
+        found, entries = self._read.load(address, int(older))
         return Saved(None, 0, entries) if found is None else Saved(found.data, found.turn, entries)
 
     def erase(self, address: str) -> None:
         """See `Journal`."""
-        self._check()
-        self.disk.write("erase", address)
+        self._write("erase", address)
 
     def keep_blocks(
         self, address: str, number: int, blocks: Sequence[tuple[int, memoryview]], compress: bool | int
     ) -> None:
         """See `Journal`."""
         self._check()
+        self._take("writes")
         pack = {(offset, len(block)): bytes(block) for offset, block in blocks}
         self.disk.write_through("keep_pack", address, number, pack)
 
     def read_blocks(self, address: str, number: int, places: Collection[tuple[int, int]]) -> Segment:
         """See `Journal`."""
-        pack = self._contents.packs.get(address, {}).get(number, {})
+        pack = self._read.packs.get(address, {}).get(number, {})
         missing = [place for place in places if place not in pack]
         if missing:
             raise DamagedStore(PATH, address, None, f"pack {number} has no block at {missing[0]}")
@@ -217,29 +218,27 @@ class SimulatedJournal:
 
     def packs(self, address: str) -> set[int]:
         """Return the packs of an address that the disk has."""
-        return set(self._contents.packs.get(address, ()))
+        return set(self._read.packs.get(address, ()))
 
     def forget_blocks(self, address: str, numbers: Collection[int]) -> None:
         """See `Journal`."""
-        self._check()
-        self.disk.write("forget_packs", address, frozenset(numbers))
+        self._write("forget_packs", address, frozenset(numbers))
 
     def addresses(self) -> list[str]:
         """See `Journal`."""
-        return self._contents.addresses()
+        return self._read.addresses()
 
     def note(self, key: str, value: bytes | None) -> None:
         """See `Journal`."""
-        self._check()
-        self.disk.write("note", key, None if value is None else bytes(value))
+        self._write("note", key, None if value is None else bytes(value))
 
     def noted(self, key: str) -> bytes | None:
         """See `Journal`."""
-        return self._contents.notes.get(key)
+        return self._read.notes.get(key)
 
     def notes(self, prefix: str) -> dict[str, bytes]:
         """See `Journal`."""
-        return self._contents.notes_from(prefix)
+        return self._read.notes_from(prefix)
 
     def close(self) -> None:
         """See `Journal`. In good order nothing is in hand."""
@@ -258,9 +257,14 @@ def _check_entry(part: object) -> None:
 
 
 class DiskWork:
-    """Work for a simulated store, which needs no thread: it begins now, and is done when its seconds are over."""
+    """Work for a simulated store, which needs no thread: it begins now, and is done when its seconds are over.
 
-    def __init__(self, journal: SimulatedJournal, call: Callable[[], Any]) -> None:
+    Attributes:
+        takes: what it takes the time of.
+    """
+
+    def __init__(self, journal: SimulatedJournal, takes: What, call: Callable[[], Any]) -> None:
+        self.takes: What = takes
         self._disk, self._journal, self._call = journal.disk, journal, call
         self._newest = journal.disk.newest()
 
@@ -270,12 +274,31 @@ class DiskWork:
             return self._call()
 
 
+WORK: Final[dict[str, What]] = {
+    "sync": "syncs",
+    "keep_blocks": "writes",
+    "forget_blocks": "writes",
+    "read_segments": "reads",
+}
+"""What the functions do that are called beside the loop."""
+
+
 def simulated(call: Callable[..., Any], args: tuple[Any, ...]) -> DiskWork | None:
     """The work that this call is, if it is one for a simulated store."""
-    function = call.args[0] if isinstance(call, functools.partial) and call.args else call  # of `asyncio.to_thread`
-    owner = getattr(function, "__self__", None)
-    journal = getattr(owner, "_engine", owner)
-    return DiskWork(journal, functools.partial(call, *args)) if isinstance(journal, SimulatedJournal) else None
+    is_partial = isinstance(call, functools.partial) and call.args  # of `asyncio.to_thread`
+    function, *given = call.args if is_partial else (call, *args)  # type: ignore[attr-defined]  # a partial has them
+    takes = WORK.get(getattr(function, "__name__", ""))
+    if takes is None:
+        return None
+    journal = _journal_of(getattr(function, "__self__", None) or next(iter(given), None))
+    return None if journal is None else DiskWork(journal, takes, functools.partial(call, *args))
+
+
+def _journal_of(owner: object) -> SimulatedJournal | None:
+    """The simulated store in which this writes, if there is one."""
+    engine = owner.engine if isinstance(owner, Commits) else owner
+    journal = engine._engine if isinstance(engine, Called) else engine
+    return journal if isinstance(journal, SimulatedJournal) else None
 
 
 class NoRootToKill(HoldfastError, text="the root cannot be killed: {why}"):

@@ -10,11 +10,14 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Hashable, Iterator
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from ...actors.kernel.node import Node
 from ...checkpoint.life.outcome_order import OutcomeOrder
 from .places import is_dead, lane_of
+
+if TYPE_CHECKING:
+    from .reduction.watch import Watch
 
 Option = tuple[Hashable, asyncio.Handle, bool]
 """Whose step it is (a node, a task, a timer, or the lane of other callbacks), what is called, and whether its place
@@ -51,6 +54,10 @@ class Chooser(Protocol):
         """A callback was taken, and is called now."""
         ...
 
+    def meet(self, node: Node) -> None:
+        """The actors of a node have something to do: for the first time, perhaps."""
+        ...
+
 
 class DueQueue:
     """Stands in for the queue of an asyncio loop: who takes the next callback gets the one that was chosen.
@@ -60,12 +67,14 @@ class DueQueue:
         is_told: whether it hears of each callback that is called.
         has_dead: whether places have died. What is scheduled for them later must not run either.
         has_cancelled: whether some that are due may have been cancelled.
+        watch: hears of each callback that is scheduled; None: nobody does.
         nodes: how many of them are of nodes.
         options: all that are due, in order.
     """
 
     def __init__(self) -> None:
         self.chooser: Chooser | None = None
+        self.watch: Watch | None = None
         self.is_told = False
         self.has_dead = self.has_cancelled = False
         self.nodes = 0
@@ -92,8 +101,12 @@ class DueQueue:
         if type(handle) is not TellingHandle:
             self._silent += 1
         self.options.append((key, handle, has_place))
+        if self.watch is not None:
+            self.watch.made(key, handle, has_place)
         if self.has_dead and is_dead(handle):
             handle.cancel()
+        elif type(owner) is Node and self.chooser is not None:
+            self.chooser.meet(owner)
 
     def popleft(self) -> asyncio.Handle:
         """Take the callback that is called next."""

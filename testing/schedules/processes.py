@@ -35,10 +35,8 @@ from ...actors.process.wire.connection import HIGH_BYTES, Connection
 from ...actors.process.worker_pool import Worker, Workers
 from ...checkpoint.life.recorded_context import RecordedContext
 from ...system.worker_main import WorkerComposition
-from ..swaps import Swaps
-from .choices import Choices
-from .disk import Latency
-from .places import SimulatedPlace, inside
+from ..latencies import DelayLine
+from .places import ProgramPlace, SimulatedPlace, inside
 
 if TYPE_CHECKING:
     from ...actors.kernel.node import Node
@@ -63,7 +61,7 @@ class Pipe(asyncio.Transport):
         self.other: Pipe
         self.protocol: asyncio.BufferedProtocol
         self._pool = pool
-        self._on_its_way: deque[tuple[float, Callable[[], None]]] = deque()
+        self._line = DelayLine(pool.loop, pool.loop.latencies.of("frames"))
         self._arrived: deque[bytes] = deque()  # and our protocol has not read it
         self._unread = 0  # bytes that the other end has not read
         self._is_reading, self._is_closing, self._is_full = True, False, False
@@ -83,7 +81,7 @@ class Pipe(asyncio.Transport):
         if self._unread > HIGH_BYTES and not self._is_full:
             self._is_full = True
             self.protocol.pause_writing()
-        self._send(functools.partial(self.other.arrived, copy))
+        self._line.send(functools.partial(self.other.arrived, copy), self.other.context)
 
     def writelines(self, list_of_data: Any) -> None:
         self.write(b"".join(list_of_data))
@@ -110,35 +108,15 @@ class Pipe(asyncio.Transport):
 
     # -- on the way -------------------------------------------------------------------------------------------------
 
-    def _send(self, go: Callable[[], None]) -> None:
-        self._on_its_way.append((self._pool.loop.time() + self._pool.latency(), go))
-        if len(self._on_its_way) == 1:
-            self._move()
-
     def times(self) -> list[float]:
         """When each thing that was written here arrives."""
-        return [when for when, _ in self._on_its_way]
-
-    def _move(self) -> None:
-        """Have the first thing that is on its way arrive: the next one never comes before it."""
-        loop, when = self._pool.loop, self._on_its_way[0][0]
-        if when <= loop.time():
-            loop.call_soon(self._arrive, context=self.other.context)
-        else:
-            loop.call_at(when, self._arrive, context=self.other.context)
-
-    def _arrive(self) -> None:
-        _, go = self._on_its_way[0]
-        go()
-        self._on_its_way.popleft()
-        if self._on_its_way:
-            self._move()
+        return self._line.times()
 
     def end(self) -> None:
         """Nothing more is written here: the other end sees that behind what was written."""
         if not self._is_closing:
             self._is_closing = True
-            self._send(self.other.ended)
+            self._line.send(self.other.ended, self.other.context)
 
     def arrived(self, data: bytes) -> None:
         """The other end has written this."""
@@ -180,7 +158,7 @@ class SimulatedProcess(SimulatedPlace):
     """
 
     def __init__(self, pid: int, pool: SimulatedWorkers) -> None:
-        super().__init__()
+        super().__init__(pool.place_name)
         self.pid, self.pool = pid, pool
         self.page = bytearray(PAGE_BYTES)
         self.context = Context()
@@ -213,7 +191,7 @@ class SimulatedProcess(SimulatedPlace):
         guest = self.guest = worker_node.Guest(
             loop, memoryview(self.page).cast("Q"), WorkerComposition, None, SimulatedEffectProcess
         )
-        self.node = guest.node
+        self.nodes.append(guest.node)
         theirs = Connection(guest.on_frame, guest.on_lost, guest.on_batch)
         guest.join(theirs)
         theirs.takers = guest.takers
@@ -317,28 +295,28 @@ class SimulatedWorkers(Workers):
 
     def __init__(self, node: Node, loop: ControlledLoop) -> None:
         super().__init__(node, "", [], on_frame, warm=0)
-        self.latency: Callable[[], float] = float  # none
         self.loop = loop
         self.root_context = copy_context()
+        place = inside.get()
+        self.place_name = "" if place is None else place.name
+        if isinstance(place, ProgramPlace):
+            place.pools.append(self)
         self._pids = itertools.count(FIRST_PID)
         self._processes: list[SimulatedProcess] = []
         self._stub = SimulatedServer()
-        self._swaps = Swaps()
-        self._swaps.put(worker_node, "_apply", _no_limits)
         self.effects = EffectProcesses(node.codec, SimulatedEffectProcess)
-
-    def draw_from(self, choices: Choices, seconds: tuple[float, float]) -> None:
-        """From now on what is written takes so many seconds, drawn, until it arrives."""
-        self.latency = Latency(choices, "latencies", seconds)
 
     async def arrived(self) -> bool:
         """Let time pass until what is on its way now has arrived. Returns whether anything was."""
-        times = [when for process in self._processes for when in process.on_its_way()]
+        times = [when for process in self._processes for when in process.on_its_way()] + self.loop.on_their_way()
         if times:
             await asyncio.sleep(max(0.0, max(times) - self.loop.time()))
         return bool(times)
 
     async def _fork(self) -> Worker:
+        seconds = self.loop.latencies.of("starts")()
+        if seconds:
+            await asyncio.sleep(seconds)
         process = SimulatedProcess(next(self._pids), self)
         worker = SimulatedWorker(self, cast("Any", process), cast("Any", self._stub))
         self._alive[process.pid] = worker
@@ -348,7 +326,6 @@ class SimulatedWorkers(Workers):
     def born(self, process: SimulatedProcess) -> None:
         """A process has its node."""
         self._processes.append(process)
-        self.loop.add(process)
 
     async def close(self) -> None:
         await super().close()
@@ -358,8 +335,7 @@ class SimulatedWorkers(Workers):
         """Every process dies."""
         for process in self._processes:
             process.die(signal.SIGKILL)
-        self._swaps.undo()
 
 
-def _no_limits(limits: dict[str, Any]) -> None:
+def no_limits(limits: dict[str, Any]) -> None:
     """They would be the limits of the test's own process."""

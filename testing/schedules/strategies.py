@@ -4,12 +4,12 @@
 - `random`: whoever could run is as likely as any other.
 - `pct`: random priorities and `depth - 1` moments at which one falls. Among n tasks and k choices it finds a bug that
   needs `depth` events in one order with a probability of at least 1 / (n k^(depth - 1)) in each run.
-- `exhaustive`: every schedule, except those that differ only in the order of turns that have nothing to do with each
-  other. For small systems whose actors share nothing but messages.
+- `exhaustive`: every schedule, except those that differ only in the order of steps that have nothing to do with each
+  other; or, with `holds`, every schedule in which at most so many times somebody is held up.
 - `coverage`: random changes to schedules that brought a new order of messages.
 
-Source: PCT: Burckhardt et al., ASPLOS 2010; sleep sets: Godefroid, LNCS 1032 (1996), chapter 5; mixing strategies and
-feedback: Coyote (Deligiannis et al., TACAS 2023) and AFL.
+Source: PCT: Burckhardt et al., ASPLOS 2010; mixing strategies and feedback: Coyote (Deligiannis et al., TACAS 2023)
+and AFL; see `reduction` for the exhaustive searches.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from typing import Final, Literal, Protocol, get_args
 
 from ...actors.errors import SpecError
 from .choices import TURN, Choices, Keys, Production, Replay, Taken, Walk
-from .footprints import ALL, Footprint, Footprints
+from .reduction.bounded import Bounded
+from .reduction.search import Exhaustive
 
 Name = Literal["mixed", "random", "pct", "exhaustive", "coverage"]
 NAMES: Final = get_args(Name)
@@ -51,8 +52,19 @@ class Strategy(Protocol):
         """The run is over."""
         ...
 
+    def covered(self, runs: int) -> str:
+        """What so many runs have covered, in words; "": nothing that could be said."""
+        ...
 
-class EachSeed:
+
+class Drawing:
+    """Never comes to an end."""
+
+    def covered(self, runs: int) -> str:
+        return ""
+
+
+class EachSeed(Drawing):
     """A schedule per seed, whatever the runs before were like."""
 
     def __init__(self, made: Callable[[int], Choices]) -> None:
@@ -65,14 +77,16 @@ class EachSeed:
         """Nothing."""
 
 
-def strategy(name: str, depth: int = DEPTH) -> Strategy:
+def strategy(name: str, depth: int = DEPTH, holds: int | None = None) -> Strategy:
     """The strategy of that name.
 
     Raises:
-        SpecError: there is none, or `depth` is not 1 or more.
+        SpecError: there is none, `depth` is not 1 or more, or `holds` is not 0 or more, or for another strategy.
     """
     if depth < 1:
         raise SpecError("simulate", f"depth must be 1 or more, not {depth!r}")
+    if holds is not None and (name != "exhaustive" or type(holds) is not int or holds < 0):
+        raise SpecError("simulate", f"holds must be 0 or more, and is for strategy='exhaustive' alone, not {holds!r}")
     match name:
         case "mixed":
             return EachSeed(mixed)
@@ -81,7 +95,7 @@ def strategy(name: str, depth: int = DEPTH) -> Strategy:
         case "pct":
             return Pct(depth)
         case "exhaustive":
-            return Exhaustive()
+            return Exhaustive() if holds is None else Bounded(holds)
         case "coverage":
             return CoverageGuided()
         case _:
@@ -133,7 +147,7 @@ class Priorities(Choices):
         return best
 
 
-class Pct:
+class Pct(Drawing):
     """PCT of one depth. The first run measures how many choices there are."""
 
     def __init__(self, depth: int) -> None:
@@ -146,7 +160,7 @@ class Pct:
         self._length = max(self._length, choices.steps, 1)
 
 
-class CoverageGuided:
+class CoverageGuided(Drawing):
     """Changes at random what has brought something new: two messages next to each other at an actor in a new order.
 
     Who came when is something new, too, but hardly a run is without: what has brought only that is taken less often.
@@ -202,98 +216,3 @@ class Changed(Replay):
 
     def redrawn(self, kind: str, number: int, count: int, proposed: int) -> int:
         return proposed if self._draw.random() < 0.5 else super().redrawn(kind, number, count, proposed)
-
-
-class ChoicePoint:
-    """One choice of the search tree, with what has been explored below it."""
-
-    def __init__(self, options: tuple[Hashable, ...], asleep: dict[Hashable, Footprint]) -> None:
-        self.options = options
-        self.asleep = asleep  # whose order against the step that led here does not matter, with what they touch
-        self.taken = next((index for index, key in enumerate(options) if key not in asleep), 0)
-        self.footprint = ALL  # of the step taken
-
-    @property
-    def is_redundant(self) -> bool:
-        """Whether every schedule from here has an equal one that was tried."""
-        return all(key in self.asleep for key in self.options)
-
-    def advance(self) -> bool:
-        """Go on to the next option; False: there is none."""
-        self.asleep[self.options[self.taken]] = self.footprint
-        left = [index for index, key in enumerate(self.options) if key not in self.asleep]
-        if not left:
-            return False
-        self.taken = left[0]
-        return True
-
-
-class Exhaustive:
-    """Depth first through all schedules, with sleep sets."""
-
-    def __init__(self) -> None:
-        self.path: list[ChoicePoint] = []
-        self._is_over = False
-
-    def choices(self, seed: int) -> Choices | None:
-        return None if self._is_over else Explored(seed, self.path)
-
-    def learn(self, choices: Choices, trace: Trace) -> None:
-        assert isinstance(choices, Explored)
-        choices.close()
-        while self.path and not self.path[-1].advance():
-            self.path.pop()
-        self._is_over = not self.path
-
-
-class Explored(Choices):
-    """One path of the search: repeated as far as it is known, then the first that does not sleep."""
-
-    def __init__(self, seed: int, path: list[ChoicePoint]) -> None:
-        super().__init__(seed)
-        self.footprints: Footprints | None = None  # tells what a step has touched
-        self._path = path
-        self._names: dict[Hashable, Hashable] = {}
-        self._is_redundant = False
-
-    def _name(self, key: Hashable) -> Hashable:
-        """The same for the same actor, task or timer in each run: paths, or the order in which they came."""
-        return self._names.setdefault(key, getattr(key, "path", None) or len(self._names))
-
-    def choose(self, count: int, keys: Keys) -> int:
-        assert self.footprints is not None
-        number = self.steps - 1
-        options = tuple(map(self._name, keys()))
-        if self._is_redundant:
-            return 0
-        if number < len(self._path):
-            if number:
-                self._path[number - 1].footprint = self.footprints.footprint()
-            point = self._path[number]
-            self.footprints.begin()
-            return min(point.taken, count - 1)
-        self.close()
-        last = self._path[-1] if self._path else None
-        slept = {} if last is None or last.footprint is ALL else last.asleep
-        step = ALL if last is None else last.footprint
-        asleep = {
-            key: touched
-            for key, touched in slept.items()
-            if key in options and touched is not ALL and not step & touched
-        }
-        point = ChoicePoint(options, asleep)
-        if point.is_redundant:
-            self._is_redundant = True
-            return 0
-        self._path.append(point)
-        self.footprints.begin()
-        return point.taken
-
-    def end(self) -> None:
-        self.close()
-        self._is_redundant = True
-
-    def close(self) -> None:
-        """Note what the last step has touched, with all that came without a choice after it."""
-        if self._path and not self._is_redundant and self.footprints is not None and self.steps >= len(self._path):
-            self._path[-1].footprint = self.footprints.footprint()

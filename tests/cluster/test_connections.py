@@ -271,8 +271,8 @@ def test_what_an_earlier_run_has_sent_is_refused_however_late() -> None:
             items = (NEW + msgspec.msgpack.encode(late),)
             for to in (NOBODY, Boot(system.lines.boot.era, "abcd"), Boot(1, "00")):
                 batch = LineBatch("client", Boot(5, "ff"), to, 0, 1, items)
-                reach.post.post("client", "inbox of bank", msgspec.msgpack.encode(batch), "client")
-            reach.post.post("client", "inbox of bank", b"garbage", "client")
+                reach.post.transport().post("inbox of bank", msgspec.msgpack.encode(batch), "client")
+            reach.post.transport().post("inbox of bank", b"garbage", "client")
             await asyncio.sleep(5.0)
             assert await system.ref("/bank/plain", Account).ask(Total()) == 0
 
@@ -461,9 +461,9 @@ def test_a_program_with_a_name_that_is_none_is_not_answered(name: str) -> None:
     async def work(reach: Reach) -> None:
         async with reach.bank() as system:
             batch = LineBatch(name, Boot(5, "ff"), NOBODY, 0, 1, ())
-            reach.post.post("client", "inbox of bank", msgspec.msgpack.encode(batch), "client")
+            reach.post.transport().post("inbox of bank", msgspec.msgpack.encode(batch), "client")
             batch = LineBatch("good", Boot(5, "no number"), NOBODY, 0, 1, ())
-            reach.post.post("client", "inbox of bank", msgspec.msgpack.encode(batch), "client")
+            reach.post.transport().post("inbox of bank", msgspec.msgpack.encode(batch), "client")
             await asyncio.sleep(1.0)
             assert not system.lines._lines
 

@@ -324,8 +324,8 @@ CHECKS = {
     ),
     "a whole system loses its clients' writes if appends name no predecessor": Check(
         "testing/fleet/broker.py",
-        "if after != self._last or self.strikes(self.faults.refused):",
-        "if self.strikes(self.faults.refused):",
+        "if after != self._last or self.dice.strikes(self.faults.refused):",
+        "if self.dice.strikes(self.faults.refused):",
         "tests/cluster/test_simulated_fleet.py",
         "clients_see_one_ledger",
     ),

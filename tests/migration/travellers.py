@@ -245,6 +245,7 @@ class Luggage:
         assert await self._ref.ask(Tie(self._neighbour))
         self._ref.tell(Keep(STASHED))
         self._reply = self._ref.ask(Later(), timeout=120.0)
+        self._reply.add_done_callback(lambda done: done.cancelled() or done.exception())  # It may never be unpacked.
         assert await self._ref.ask(Remind(0.3))
 
     async def unpack(self) -> dict[str, Any]:

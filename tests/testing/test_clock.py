@@ -201,3 +201,15 @@ def test_the_clock_begins_where_it_is_told_to() -> None:
     with asyncio.Runner(loop_factory=lambda: VirtualClockLoop(start=100.0)) as runner:
         runner.run(asyncio.sleep(0.5))
         assert runner.get_loop().time() == 100.5
+
+
+def test_time_that_a_call_takes_passes_at_once_and_what_is_due_then_comes() -> None:
+    async def run() -> float:
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, VirtualClockLoop)
+        loop.pass_time(25.0)
+        await asyncio.sleep(1e-20)
+        return loop.time()
+
+    with asyncio.Runner(loop_factory=lambda: VirtualClockLoop(ticks=100)) as runner:
+        assert runner.run(run()) == 25.0

@@ -15,6 +15,7 @@ from holdfast.actors.kernel import loop
 from holdfast.testing import POINTS, Faults, GuardedSystem, Probe, UnexpectedEnd, idle
 from holdfast.testing.damage import damaged
 from holdfast.testing.faults import InjectedCrash
+from holdfast.testing.fleet.sim_fleet import SimFleet, SimProgram
 from tests.testing.players import Add, Counter, Linger, Total
 
 virtual = pytest.mark.asyncio(loop_factories=["virtual"])
@@ -480,6 +481,46 @@ def test_damage_is_another_value_of_the_same_type(value: Any) -> None:
 @pytest.mark.parametrize("value", [None, [], {}, (), Total(), object()])
 def test_what_has_no_other_value_stays(value: Any) -> None:
     assert damaged(value, random.Random(0)) is value or damaged(value, random.Random(0)) == value
+
+
+async def serve_counter(program: SimProgram) -> None:
+    async with program.open() as system:
+        await system.start(hf.child("counter", hf.start(Counter)))
+        await asyncio.Event().wait()
+
+
+@virtual
+@pytest.mark.parametrize("kind", ["drop", "duplicate", "delay", "cut", "crash"])
+async def test_post_faults_reach_the_client_of_a_program(kind: str, sim_fleet: SimFleet, faults: Faults) -> None:
+    program = sim_fleet.start(serve_counter, again=1.0)
+    async with hf.connect(sim_fleet.servers(), timeout=60.0) as connection:
+        ref, loop = connection.ref("/app/counter", Counter), asyncio.get_running_loop()
+        assert await ref.ask(Add(1), timeout=60.0) == 1
+        odds: dict[str, Any] = {kind: 1.0}
+        async with faults.on(program, at="post", times=1, seconds=3.0, **odds) as strikes:
+            asked = loop.time()
+            try:
+                total = await ref.ask(Add(1), timeout=60.0)
+            except hf.AskFailed:  # It was handled, or not, by a program that is dead.
+                assert kind == "crash"
+                return
+            assert total == 2, "an ask that comes twice is handled once"
+            assert len(strikes.struck) == 1
+            assert (loop.time() > asked + 2.0) == (kind == "cut")
+
+
+@virtual
+@pytest.mark.parametrize("kind", ["drop", "cut", "split", "crash"])
+async def test_request_faults_have_another_program_lead(kind: str, sim_fleet: SimFleet, faults: Faults) -> None:
+    first = sim_fleet.start(serve_counter)
+    async with hf.connect(sim_fleet.servers(), timeout=60.0):
+        second = sim_fleet.start(serve_counter)
+        await asyncio.sleep(1.0)
+        odds: dict[str, Any] = {kind: 1.0}
+        async with faults.on(first, at="request", times=1, seconds=20.0, after=2, **odds):
+            await asyncio.sleep(15.0)
+            is_left_behind = "program 2" in faults.strikes[0].what
+            assert second.leads != is_left_behind
 
 
 def test_an_injected_crash_names_its_seed() -> None:

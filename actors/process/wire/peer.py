@@ -6,7 +6,6 @@ import asyncio
 import math
 import types
 from collections.abc import Callable, Iterable
-from time import monotonic
 from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
@@ -337,12 +336,12 @@ class RelayedAsk(Ask, eq=False):
     number: int = 0
     page: Any = None
     is_over: bool = False
-    until: float = math.inf  # the deadline on the monotonic clock, which both sides read; without a frame, none
+    until: float = math.inf  # the deadline on the clock of the machine, which both sides read; without a frame, none
 
     @classmethod
     def taken(cls, peer: Peer, frame: frames.Ask, cell: Cell, page: memoryview | None) -> RelayedAsk:
         """The ask that a frame carries; its message is decoded behind it."""
-        left = frame.until - monotonic()
+        left = frame.until - peer.node.clock.machine()
         deadline = peer.node.loop.time() + left
         number, until = frame.number, frame.until
         return cls(
@@ -354,7 +353,8 @@ class RelayedAsk(Ask, eq=False):
         page = item.page
         if page is not None:
             page[0] = item.number
-        if item.until <= monotonic():  # In this order: if the page did not say so at the deadline, it is not run.
+        # In this order: if the page did not say so at the deadline, it is not run.
+        if item.until <= item.to.node.clock.machine():
             item.expire()
             if page is not None:
                 page[1] = item.number

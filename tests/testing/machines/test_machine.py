@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 import hypothesis.strategies as st
 import pytest
 from hypothesis import Phase, settings
+from hypothesis.internal.conjecture import engine
 from hypothesis.stateful import precondition, rule, run_state_machine_as_test
 
 import holdfast as hf
@@ -235,19 +236,40 @@ def test_nothing_is_found_in_what_is_right(machine: type[ActorMachine]) -> None:
 
 @pytest.mark.parametrize(("machine", "errors"), WRONG)
 def test_a_planted_bug_is_found_and_its_example_can_be_repeated(
-    machine: type[ActorMachine], errors: tuple[type[BaseException], ...]
+    machine: type[ActorMachine], errors: tuple[type[BaseException], ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(machine, "shrink_seconds", 300.0)  # The computer may do other things, too.
     with pytest.raises(errors) as caught:
         run_state_machine_as_test(machine, settings=settings(QUICK, max_examples=200))
     notes = "\n".join(caught.value.__notes__)
+    assert "cut short" not in notes
     lines = re.findall(r"^state\.(\w+)\((.*)\)$", notes, re.M)
     schedule = re.search(r'schedule="([^"]*)"', notes)
     assert schedule is not None
     assert len(lines) <= 8
-    assert "turns:" in notes
+    assert re.search(r"^the \d+ turns ", notes, re.M)
     with pytest.raises(errors) as again:
         repeat(machine, schedule[1], notes)
     assert type(again.value) is type(caught.value)
+
+
+class Hurried(LostUpdate):
+    """Has no time to look for a simpler example."""
+
+    shrink_seconds = 0.0
+
+
+def test_shrinking_ends_within_its_time_and_says_that_it_was_cut_short() -> None:
+    own = engine.MAX_SHRINKING_SECONDS
+    with pytest.raises(NotLinearizable) as caught:
+        run_state_machine_as_test(Hurried, settings=settings(QUICK, max_examples=200))
+    assert "shrinking was cut short after 0 s" in "\n".join(caught.value.__notes__)
+    assert own == engine.MAX_SHRINKING_SECONDS
+
+
+def test_a_time_for_shrinking_that_cannot_be_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"Wrong\.shrink_seconds must be >= 0 seconds, not -1"):
+        type("Wrong", (ActorMachine,), {"shrink_seconds": -1})
 
 
 def repeat(machine: type[ActorMachine], schedule: str, notes: str) -> None:

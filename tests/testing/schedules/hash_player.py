@@ -8,6 +8,7 @@ from typing import Any
 import holdfast as hf
 from holdfast.testing import GuardedSystem, Simulation, idle
 from holdfast.testing.simulation import run_seed
+from tests.testing.fleet.locks import two_hold_one_lock
 
 
 class Add(hf.Message[int]):
@@ -77,4 +78,7 @@ if __name__ == "__main__":
     for seed in range(6):
         options = {"store": "simulated", "durability": "fsync"}
         for path, what in run_seed(lives, seed, {"system", "simulation"}, options).trace:
+            print(seed, path, what)
+    for seed in range(3):  # In none of them the bug shows.
+        for path, what in run_seed(two_hold_one_lock, seed, {"fleet", "faults"}, {}).trace:
             print(seed, path, what)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import threading
 
+from holdfast.actors.kernel.node import Node
 from holdfast.testing import GuardedSystem
 from holdfast.testing.schedules.choices import Walk
 from holdfast.testing.schedules.control import ControlledLoop
@@ -20,6 +21,9 @@ class Last:
 
     def called(self, option: Option) -> None:
         """It does not matter."""
+
+    def meet(self, node: Node) -> None:
+        """There is none."""
 
 
 def test_callbacks_keep_their_order_and_come_before_steps_behind_them() -> None:

@@ -86,8 +86,27 @@ async def test_it(system):
 """
 
 
-def test_what_is_known_of_a_failure_is_kept_where_it_is_asked_for(pytester: pytest.Pytester) -> None:
-    result = run_suite(pytester, HEAD + FAILS, "--holdfast-record", "artefacts")
+FAILS_IN_A_FLEET = """
+from holdfast.testing import simulate
+
+async def main(program):
+    async with program.open() as system:
+        await system.start(hf.child("counter", hf.start(Counter)))
+        await asyncio.Event().wait()
+
+@simulate(seeds=3)
+async def test_it(fleet):
+    fleet.start(main)
+    async with hf.connect(fleet.servers(), timeout=60.0) as connection:
+        assert await connection.ref("/app/counter", Counter).ask(Add(1)) == 2
+"""
+
+
+@pytest.mark.parametrize(("tests", "address"), [(FAILS, "/app/$1"), (FAILS_IN_A_FLEET, "program 1:/app/counter")])
+def test_what_is_known_of_a_failure_is_kept_where_it_is_asked_for(
+    pytester: pytest.Pytester, tests: str, address: str
+) -> None:
+    result = run_suite(pytester, HEAD + tests, "--holdfast-record", "artefacts")
     assert result.ret == 1
     (folder,) = (pytester.path / "artefacts").iterdir()
     assert sorted(file.name for file in folder.iterdir()) == ["chart.html", "failure.txt", "schedule.txt"]
@@ -96,8 +115,8 @@ def test_what_is_known_of_a_failure_is_kept_where_it_is_asked_for(pytester: pyte
     assert told[0].endswith("::test_it")
     assert "AssertionError" in told[1]
     assert any(line.startswith("seed=0: repeat it with") for line in told)
-    assert told[-1].split("\t")[2:] == ["/app/$1", "Add(n=1)", "total: 0 -> 1"]
-    again = run_suite(pytester, HEAD + FAILS, "--holdfast-replay", str(folder / "schedule.txt"))
+    assert told[-1].split("\t")[2:] == [address, "Add(n=1)", "total: 0 -> 1"]
+    again = run_suite(pytester, HEAD + tests, "--holdfast-replay", str(folder / "schedule.txt"))
     assert again.ret == 1
     assert f'replay="{schedule}"' in str(again.stdout)
 
@@ -198,8 +217,19 @@ def test_what_has_failed_is_tried_first_until_it_passes(pytester: pytest.Pyteste
 
 
 @pytest.mark.parametrize(
-    ("args", "count"), [((), 5), (("--holdfast-profile", "ci"), 5), (("--holdfast-profile", "nightly"), 125)]
+    ("args", "count", "twice"),
+    [
+        ((), 5, 10),
+        (("--holdfast-profile", "ci"), 5, 10),
+        (("--holdfast-profile", "nightly"), 125, 1),
+        (("--holdfast-twice", "2"), 5, 2),
+        (("--holdfast-profile", "nightly", "--holdfast-seeds", "5", "--holdfast-twice", "3"), 5, 3),
+    ],
+    ids=["none", "ci", "nightly", "twice", "all"],
 )
-def test_a_profile_has_its_number_of_seeds(pytester: pytest.Pytester, args: tuple[str, ...], count: int) -> None:
+def test_a_profile_has_its_number_of_seeds_and_of_runs_made_twice(
+    pytester: pytest.Pytester, args: tuple[str, ...], count: int, twice: int
+) -> None:
     run_suite(pytester, HEAD + TELLS_ITS_SEEDS.replace("!= 3", ">= 0"), "--collect-only")
-    assert {*seeds_run(pytester, *args)} == {*range(count)}
+    expected = [seed for seed in range(count) for _ in range(1 + (seed % twice == 0))]
+    assert seeds_run(pytester, *args) == expected
