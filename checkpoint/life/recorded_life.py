@@ -28,7 +28,7 @@ from ...actors.events import RecordsMapped
 from ...actors.exit_reasons import ExitReason
 from ...actors.kernel import lifecycle, mailbox
 from ...actors.kernel.actor import Actor, Start
-from ...actors.kernel.cell import RUNNING, Cell
+from ...actors.kernel.cell import DOWN, RUNNING, Cell
 from ...actors.kernel.envelope import Item
 from ...actors.kernel.message import message_name
 from ...actors.persistence import UNFIT
@@ -52,6 +52,7 @@ from ..protocol import (
     Hooked,
     Ignored,
     Kept,
+    Leaving,
     Live,
     Out,
     Outcome,
@@ -219,7 +220,8 @@ class Life:
             case Perform():
                 self._perform(record)
             case Stranded():
-                self.waits.stranded |= {(record.turn, record.k)}
+                place = frozenset({(record.turn, record.k)})
+                self.waits.stranded = self.waits.stranded - place if record.is_over else self.waits.stranded | place
                 self.cell.node.loop.call_soon(self.leave_waiting)
             case Glance():  # Not here and now: this may be called in a turn of the very actor.
                 self.cell.node.loop.call_soon(answer_beside, self, record.feed)
@@ -421,6 +423,7 @@ class Life:
             return
         self.stage.stopping = reason
         self.cell.urge(StopRecorded(self, reason))
+        self.port.to_home(Leaving())
         self.leave_waiting()
 
     def leave_waiting(self) -> None:
@@ -428,10 +431,15 @@ class Life:
         reason, turn = self.stage.stopping, None if self.cell.more is None else self.cell.more.turn
         if reason is None or turn is None or turn.then is not None or turn.killed or self.feed is None:
             return
-        if self.is_live and self.method.replays and (self.waits.resting or self.waits.are_stranded):
+        if self.is_live and self.method.replays and (self.waits.resting or self.waits.are_stranded(self._has_nobody)):
             if self.word is not None:
                 self.word.mark(OVER)  # No end of this life is due to the turn.
             self._leave(turn, reason)
+
+    def _has_nobody(self, awaited: Awaited) -> bool:
+        """Whether it is an answer of somebody in this process who is between two lives."""
+        cell = self.cell.node.find(awaited.actor) if isinstance(awaited, Asked) else None
+        return cell is not None and cell.state is DOWN
 
     def _leave(self, turn: Suspended, reason: ExitReason) -> None:
         self.feed, self.outs = None, []  # What its handler says while it is cancelled does not count.

@@ -1,0 +1,162 @@
+"""What a recorded turn asks of a supervisor, a registry or a pool that was stopped before it: the next life answers."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+from collections.abc import AsyncGenerator, Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import holdfast as hf
+from tests.checkpoint.players import Do, Doer, Seen, until
+from tests.checkpoint.runtime_player import VERBS, Clerk, Kid
+from tests.checkpoint.strikes import let_through
+
+IN_TIME = 15.0
+IS_WHOLE = bool(os.environ.get("HOLDFAST_CROSSED"))
+
+
+def asked(verb: str, isolation: Any = "task", gate: Path | None = None) -> hf.ChildSpec:
+    """Whoever is asked."""
+    match verb:
+        case "start" | "any":
+            kid = hf.child(None, hf.start(Kid, "" if gate is None else str(gate)))
+            return hf.dynamic("b", template=kid, journal=verb == "start", isolation=isolation)
+        case "which":
+            return hf.supervisor("b", children=[hf.child("kid", hf.start(Kid))], isolation=isolation)
+        case "lookup" | "register":
+            return hf.supervision.registry("b")
+        case "pool" | "size":
+            return hf.supervision.pool("b", hf.start(Kid), size=2, isolation=isolation)
+        case _:
+            return hf.supervision.partitions("b", hf.start(Kid), count=2, isolation=isolation)
+
+
+def team(verb: str, asker: Any = "task", isolation: Any = "task", *, first: str = "a", **options: Any) -> hf.ChildSpec:
+    """Whoever asks (a) is started first, unless somebody else is `first`; so it is stopped last."""
+    clerk = hf.child(
+        "a",
+        hf.start(Clerk),
+        recovery=hf.hybrid(interval=3600.0),
+        isolation="process" if asker == "process" else "task",
+        shutdown=4 * IN_TIME,
+        **({"mechanism": hf.ftm.PBR()} if asker == "pbr" else {}),
+    )
+    a = hf.supervisor("of-a", children=[clerk], isolation="process") if asker == "subtree" else clerk
+    both = [a, asked(verb, isolation, options.pop("gate", None))]
+    fragile = hf.child("fragile", hf.start(Doer), rules=[hf.rule(OSError, "escalate")])
+    plain = hf.child("plain", hf.start(Doer))
+    order = [fragile, plain, *(both if first == "a" else reversed(both))]
+    return hf.supervisor("team", children=order, intensity=1000, **options)
+
+
+@contextlib.asynccontextmanager
+async def running(spec: hf.ChildSpec, store: str | None = None) -> AsyncGenerator[hf.ActorSystem]:
+    async with hf.ActorSystem("app", log=False, intensity=1000, store=store) as system:
+        await system.start(spec)
+        yield system
+
+
+def root(system: hf.ActorSystem) -> hf.ActorRef[hf.Supervisor]:
+    return system.ref("/app", hf.Supervisor)
+
+
+def clerk(system: hf.ActorSystem, asker: str = "task") -> hf.ActorRef[Clerk]:
+    return system.ref("/app/team/of-a/a" if asker == "subtree" else "/app/team/a", Clerk)
+
+
+async def restarted(system: hf.ActorSystem) -> None:
+    await root(system).ask(hf.RestartChild("team", running=True), timeout=4 * IN_TIME)
+
+
+async def ordered(system: hf.ActorSystem) -> None:
+    await root(system).ask(hf.TerminateChild("team"), timeout=4 * IN_TIME)
+    await root(system).ask(hf.RestartChild("team"), timeout=IN_TIME)
+
+
+async def escalated(system: hf.ActorSystem) -> None:
+    system.ref("/app/team/fragile", Doer).tell(Do(["fail"]))
+
+
+async def together(system: hf.ActorSystem) -> None:
+    """A sibling crashes, and all behind it are restarted with it."""
+    system.ref("/app/team/plain", Doer).tell(Do(["fail"]))
+
+
+HOWS: dict[str, tuple[Callable[[hf.ActorSystem], Awaitable[None]], dict[str, Any]]] = {
+    "restart": (restarted, {}),
+    "stop and start": (ordered, {}),
+    "escalation": (escalated, {}),
+    "one_for_all": (together, {"strategy": "one_for_all"}),
+    "rest_for_one": (together, {"strategy": "rest_for_one"}),
+}
+
+
+async def heard(system: hf.ActorSystem, asker: str, verb: str) -> list[str]:
+    """What the one that asks has noted, when it has an answer."""
+    async with asyncio.timeout(IN_TIME):
+        while True:
+            with contextlib.suppress(hf.ActorStopped, hf.errors.NoSuchActor):
+                seen = await clerk(system, asker).ask(Seen(), timeout=IN_TIME)
+                if any(one.startswith(f"{verb}:") for one in seen):
+                    return seen
+            await asyncio.sleep(0.002)
+
+
+async def asks(system: hf.ActorSystem, asker: str, verb: str, gate: Path) -> Callable[[], bool]:
+    """Have it ask as soon as it is let through; what is returned says whether the other one has been stopped."""
+    await clerk(system, asker).send(Do([f"gate {gate}", "add begun", verb]))
+    await until(gate.exists, IN_TIME)
+    cell = system.ref("/app/team/b", hf.Actor)._cell
+    return lambda: cell.state in ("down", "gone")
+
+
+FEW = [
+    *(("task", "task", "restart", verb) for verb in VERBS),
+    *(("task", "task", how, "start") for how in HOWS if how != "restart"),
+    *(("task", "task", "one_for_all", verb) for verb in ("lookup", "pool")),
+    ("process", "task", "restart", "which"),
+    ("task", "process", "restart", "start"),
+]
+PLACES = [(a, b) for a in ("task", "process", "subtree", "pbr") for b in ("task", "process")]
+ORDERS = ("start", "any")
+"""What may be said from a process only to those that it is bound to."""
+WHOLE = [
+    (a, b, how, verb) for a, b in PLACES for how in HOWS for verb in VERBS if a == "task" or verb not in ORDERS
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("asker", "place", "how", "verb"), WHOLE if IS_WHOLE else FEW)
+async def test_the_next_life_answers(asker: str, place: str, how: str, verb: str, tmp_path: Path) -> None:
+    gate, (end, options) = tmp_path / "gate", HOWS[how]
+    async with running(team(verb, asker, place, **options)) as system:
+        has_ended = await asks(system, asker, verb, gate)
+        ending = asyncio.ensure_future(end(system))
+        await until(has_ended, IN_TIME)
+        let_through(gate)
+        await asyncio.wait_for(ending, IN_TIME)
+        assert await heard(system, asker, verb) == ["begun", f"{verb}:{VERBS[verb]}"]
+
+
+PROGRAMS = [("task", "task", verb) for verb in VERBS] + [("process", "task", "which"), ("task", "process", "any")]
+WHOLE_PROGRAMS = [(a, b, verb) for a, b in PLACES for verb in VERBS if a == "task" or verb not in ORDERS]
+
+
+@pytest.mark.parametrize("first", ["a", "b"] if IS_WHOLE else ["a"])
+@pytest.mark.parametrize(("asker", "place", "verb"), WHOLE_PROGRAMS if IS_WHOLE else PROGRAMS)
+async def test_the_next_program_asks_again(asker: str, place: str, verb: str, first: str, tmp_path: Path) -> None:
+    store, gate = f"sqlite:{tmp_path / 'app.db'}", tmp_path / "gate"
+    async with contextlib.AsyncExitStack() as program:
+        system = await program.enter_async_context(running(team(verb, asker, place, first=first), store))
+        has_ended = await asks(system, asker, verb, gate)
+        ending = asyncio.ensure_future(program.aclose())
+        if first == "a":
+            await until(has_ended, IN_TIME)
+        let_through(gate)
+        await asyncio.wait_for(ending, IN_TIME)
+    async with running(team(verb, asker, place, first=first), store) as system:
+        assert await heard(system, asker, verb) == ["begun", f"{verb}:{VERBS[verb]}"]
