@@ -63,7 +63,7 @@ class NextLives:
     def is_to_come(self, target: Cell) -> bool:
         """Whether one of the runtime's actors is about to be started where nobody lives at the moment."""
         kind = self._runtime.to_come(self._homes.node, target.path)
-        return kind is not None and kind._is_asked_again
+        return kind is not None and kind._is_asked_again and self._lasts
 
     def takes(self, ask: SwitchAsk, error: BaseException) -> bool:
         """Whether an ask has not failed by the end of who was asked: it is asked of the next life."""
@@ -84,7 +84,12 @@ class NextLives:
 
     def _may_come(self, gone: Cell) -> bool:
         """Whether an address that was given up may have a next life: its supervisor has ended, and comes back."""
-        return gone.host.parent.is_restarting(gone) and (self._homes.journal.durable or self._is_up)
+        return gone.host.parent.is_restarting(gone) and self._lasts
+
+    @property
+    def _lasts(self) -> bool:
+        """Whether the asks outlive the end that is under way, if one is."""
+        return self._homes.journal.durable or self._is_up
 
     @property
     def _is_up(self) -> bool:
@@ -112,17 +117,20 @@ class NextLives:
     def wait(self, ask: SwitchAsk, path: str) -> None:
         """Have an ask wait until somebody lives at an address; in a program that ends, for the next one."""
         ask.strand()
-        if not self._is_up:
-            if ask.doubt is None:
-                ask.switch.calls.note_unasked(ask, is_so=True)
-            ask.drop()  # With its whole time limit: that of this program is not to run out while others are stopped.
-            return
         waiting = self._waiting.get(path)
         if waiting is None:
-            self._waiting[path] = [ask]
+            waiting = self._waiting[path] = []
             self._homes.node.awaited.setdefault(path, []).append(functools.partial(self._come, path))
-        else:
-            waiting.append(ask)
+        waiting.append(ask)
+        self.rest(ask)
+
+    def rest(self, ask: SwitchAsk) -> None:
+        """Leave an ask that waits to the next program, if this one ends; it has its whole time limit there."""
+        if ask.is_over or self._is_up or ask not in self._waiting.get(ask.target.path, ()):
+            return
+        if ask.doubt is None:
+            ask.switch.calls.note_unasked(ask, is_so=True)
+        ask.drop()
 
     def _come(self, path: str) -> None:
         for ask in self._waiting.pop(path, ()):

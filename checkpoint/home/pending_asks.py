@@ -340,6 +340,7 @@ class PendingCalls:
         for (turn, _), ask in list(self.asks.items()):
             if turn > self._home.ledger.turn and ask.has_nobody:
                 ask.tell_stranded()
+                self._home.homes.rejoin.next_lives.rest(ask)
 
     def order(self, turn: int, out: Out) -> None:
         """Have the present life perform an effect: all that precedes it is safe."""

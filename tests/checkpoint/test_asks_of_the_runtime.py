@@ -14,7 +14,7 @@ import pytest
 import holdfast as hf
 from tests.checkpoint.players import Do, Doer, Seen, until
 from tests.checkpoint.runtime_player import VERBS, Clerk, Kid
-from tests.checkpoint.strikes import let_through
+from tests.checkpoint.strikes import home, let_through
 
 IN_TIME = 15.0
 IS_WHOLE = bool(os.environ.get("HOLDFAST_CROSSED"))
@@ -160,3 +160,62 @@ async def test_the_next_program_asks_again(asker: str, place: str, verb: str, fi
         await asyncio.wait_for(ending, IN_TIME)
     async with running(team(verb, asker, place, first=first), store) as system:
         assert await heard(system, asker, verb) == ["begun", f"{verb}:{VERBS[verb]}"]
+
+
+@pytest.mark.parametrize("how", ["restart", "one_for_all", "program"])
+async def test_a_start_that_is_under_way_is_asked_for_again(how: str, tmp_path: Path) -> None:
+    """Whoever is started by its id is there already, or is started by the next life."""
+    store, gate, starts = f"sqlite:{tmp_path / 'app.db'}", tmp_path / "gate", tmp_path / "starts"
+    _, options = HOWS.get(how, (None, {}))
+    async with contextlib.AsyncExitStack() as program:
+        system = await program.enter_async_context(running(team("start", gate=starts, **options), store))
+        await asks(system, "task", "start", gate)
+        let_through(gate)
+        await until(starts.exists, IN_TIME)
+        end = program.aclose() if how == "program" else HOWS[how][0](system)
+        ending = asyncio.ensure_future(end)
+        cell = system.ref("/app/team/b", hf.Actor)._cell
+        await until(lambda: cell.state in ("down", "gone") or cell.life > 1, IN_TIME)
+        let_through(starts)
+        await asyncio.wait_for(ending, IN_TIME)
+        if how != "program":
+            assert await heard(system, "task", "start") == ["begun", f"start:{VERBS['start']}"]
+            return
+    async with running(team("start"), store) as system:
+        assert await heard(system, "task", "start") == ["begun", f"start:{VERBS['start']}"]
+
+
+@pytest.mark.parametrize("verb", ["start", "lookup", "pool"])
+async def test_without_a_store_the_turn_hears_of_the_end_of_the_program(verb: str, tmp_path: Path) -> None:
+    gate = tmp_path / "gate"
+    async with contextlib.AsyncExitStack() as program:
+        system = await program.enter_async_context(running(team(verb)))
+        has_ended, stream = await asks(system, "task", verb, gate), system.events()
+        ending = asyncio.ensure_future(program.aclose())
+        await until(has_ended, IN_TIME)
+        let_through(gate)
+        await asyncio.wait_for(ending, IN_TIME)
+        crashed = [one for one in stream.take() if isinstance(one, hf.events.ActorCrashed)]
+        assert [one.address for one in crashed] == ["/app/team/a"]
+        assert "ActorStopped" in str(crashed[0].reason)
+
+
+@pytest.mark.parametrize("how", ["its supervisor is forgotten", "it is stopped alone"])
+async def test_the_turn_hears_that_nobody_comes_back(how: str) -> None:
+    async with running(team("start")) as system:
+        other = await system.start(hf.child("other", hf.start(Clerk), recovery=hf.hybrid()))
+        supervisor = system.ref("/app/team", hf.Supervisor)
+        with system.events() as stream:
+            if how == "it is stopped alone":
+                await supervisor.ask(hf.TerminateChild("b"), timeout=IN_TIME)
+            else:
+                await root(system).ask(hf.TerminateChild("team"), timeout=IN_TIME)
+            await other.send(Do(["start"]))
+            if how != "it is stopped alone":
+                await until(lambda: bool(home(other).calls.asks), IN_TIME)
+                await root(system).ask(hf.DeleteChild("team"), timeout=IN_TIME)
+            async with asyncio.timeout(IN_TIME):
+                async for one in stream:
+                    if isinstance(one, hf.events.ActorCrashed):
+                        assert "ActorStopped" in str(one.reason)
+                        break
