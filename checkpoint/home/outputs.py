@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from ...actors.control.trace_tail import enveloped, follow, with_tail
 from ...actors.errors import AskDeadlock, HoldfastError, MailboxFull
-from ...actors.kernel.cell import GONE, Cell
+from ...actors.kernel.cell import DOWN, GONE, Cell
 from ...actors.kernel.codec import Parcel
 from ...actors.kernel.envelope import Chain, waiters
 from ..durable_links import UNDONE_BY, connect
@@ -321,6 +321,8 @@ class Outputs:
             self._record_ask(switch, ask, out, home.path, batch)
         if switch is not None and switch.intake.between is not None:
             batch.after.append(ask.strand)
+        elif target.state is DOWN:
+            batch.after.append(ask.tell_stranded)
 
     def _made(self, turn: int, key: int, out: Out, target: Cell) -> SwitchAsk:
         """The ask that is an output of the turn in hand, which waits for it from now on."""

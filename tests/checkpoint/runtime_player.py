@@ -1,4 +1,4 @@
-"""A recorded actor that asks supervisors, registries and pools, each by one of their verbs."""
+"""A recorded actor that asks supervisors, registries, pools, and a recorded one, each by one of their verbs."""
 
 from __future__ import annotations
 
@@ -52,6 +52,8 @@ class Clerk(Doer):
                 if verb == "register":
                     return await registry.register("key", 1)
                 return await registry.lookup("nobody's")
+            case "note":
+                return await at.ask(Note("hello"), timeout=TIME)
             case "pool":
                 return await self.ctx.find(f"{ASKED}/router", Kid).ask(Note("four"), timeout=TIME)
             case "size":
@@ -68,6 +70,7 @@ VERBS = {
     "which": "True",
     "lookup": "[]",
     "register": "None",
+    "note": "1",
     "pool": "4",
     "size": "2",
     "route": ASKED,

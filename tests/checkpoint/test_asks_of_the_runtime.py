@@ -24,12 +24,14 @@ def asked(verb: str, isolation: Any = "task", gate: Path | None = None) -> hf.Ch
     """Whoever is asked."""
     match verb:
         case "start" | "any":
-            kid = hf.child(None, hf.start(Kid, "" if gate is None else str(gate)))
+            kid = hf.child(None, hf.start(Kid, "" if gate is None else str(gate)), shutdown=0.1)
             return hf.dynamic("b", template=kid, journal=verb == "start", isolation=isolation)
         case "which":
             return hf.supervisor("b", children=[hf.child("kid", hf.start(Kid))], isolation=isolation)
         case "lookup" | "register":
             return hf.supervision.registry("b")
+        case "note":
+            return hf.child("b", hf.start(Doer), recovery=hf.hybrid(), isolation=isolation)
         case "pool" | "size":
             return hf.supervision.pool("b", hf.start(Kid), size=2, isolation=isolation)
         case _:
@@ -119,7 +121,9 @@ FEW = [
     *(("task", "task", "restart", verb) for verb in VERBS),
     *(("task", "task", how, "start") for how in HOWS if how != "restart"),
     *(("task", "task", "one_for_all", verb) for verb in ("lookup", "pool")),
-    ("process", "task", "restart", "which"),
+    ("task", "task", "one_for_all", "note"),
+    ("process", "task", "one_for_all", "note"),
+    ("process", "task", "rest_for_one", "which"),
     ("task", "process", "restart", "start"),
 ]
 PLACES = [(a, b) for a in ("task", "process", "subtree", "pbr") for b in ("task", "process")]
@@ -219,3 +223,21 @@ async def test_the_turn_hears_that_nobody_comes_back(how: str) -> None:
                     if isinstance(one, hf.events.ActorCrashed):
                         assert "ActorStopped" in str(one.reason)
                         break
+
+
+@pytest.mark.parametrize("asker", ["task", "process"])
+async def test_who_waits_already_for_one_that_is_restarted_with_it_does_not_hold_that_up(
+    asker: str, tmp_path: Path
+) -> None:
+    gate, other = tmp_path / "gate", tmp_path / "other"
+    async with running(team("note", asker, strategy="one_for_all")) as system:
+        ref = system.ref("/app/team/b", Doer)
+        ref.tell(Do([f"gate {other}"]))
+        await until(other.exists, IN_TIME)
+        await asks(system, asker, "note", gate)
+        let_through(gate)
+        await until(lambda: any(source.ask is not None for source in home(ref).open.values()), IN_TIME)
+        await together(system)
+        await until(lambda: bool(ref._cell.extra().urgent), IN_TIME)
+        let_through(other)
+        assert await heard(system, asker, "note") == ["begun", "note:1"]
