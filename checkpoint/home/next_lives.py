@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from ...actors.errors import ActorStopped, AskFailed
 from ...actors.kernel.cell import DOWN, GONE, RUNNING, Cell
 from ...actors.kernel.node import cell_kind
+from .recorded_home import switch_of
 
 if TYPE_CHECKING:
     from ...actors.kernel.actor import Actor
@@ -64,6 +65,11 @@ class NextLives:
         """Whether one of the runtime's actors is about to be started where nobody lives at the moment."""
         kind = self._runtime.to_come(self._homes.node, target.path)
         return kind is not None and kind._is_asked_again and self._lasts
+
+    def answers(self, cell: Cell) -> bool:
+        """Whether what waits at an address between two lives is answered by the next one, also in the next program."""
+        kind = cell_kind(cell)
+        return self._is_up or switch_of(cell) is not None or (kind is not None and kind._is_asked_again)
 
     def takes(self, ask: SwitchAsk, error: BaseException) -> bool:
         """Whether an ask has not failed by the end of who was asked: it is asked of the next life."""
@@ -121,7 +127,7 @@ class NextLives:
         if waiting is None:
             waiting = self._waiting[path] = []
             self._homes.node.awaited.setdefault(path, []).append(functools.partial(self._come, path))
-        waiting.append(ask)
+        waiting[:] = [*(one for one in waiting if not one.is_over), ask]
         self.rest(ask)
 
     def rest(self, ask: SwitchAsk) -> None:
@@ -150,4 +156,5 @@ class NextLives:
 
     def _give_up(self, path: str) -> None:
         for ask in self._waiting.pop(path, ()):
+            ask.out = None  # It is not asked again.
             ask.fail(ActorStopped(path, "it is not started again"))

@@ -321,7 +321,7 @@ class Outputs:
             self._record_ask(switch, ask, out, home.path, batch)
         if switch is not None and switch.intake.between is not None:
             batch.after.append(ask.strand)
-        elif target.state is DOWN:
+        elif target.state is DOWN and ask.has_nobody:
             batch.after.append(ask.tell_stranded)
 
     def _made(self, turn: int, key: int, out: Out, target: Cell) -> SwitchAsk:
@@ -367,7 +367,8 @@ class Outputs:
             home.homes.rejoin.next_lives.wait(ask, target.path)
             return
         parcel: Any = ask.message
-        ask.unstrand()
+        if target.state is not DOWN:
+            ask.unstrand()
         home.calls.note_unasked(ask, is_so=False)
         try:
             ctx = target.ctx

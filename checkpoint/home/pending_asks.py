@@ -159,9 +159,11 @@ class SwitchAsk(RelayedAsk, eq=False):
 
     @property
     def has_nobody(self) -> bool:
-        """Whether nobody lives at the moment where it is to be answered."""
-        cell = None if self.out is None else self.switch.node.find(self.out.to)
-        return self.is_stranded or (cell is not None and cell.state is DOWN)
+        """Whether nobody lives at the moment where it is to be answered, and whoever does next answers it."""
+        if self.is_stranded or self.out is None:
+            return self.is_stranded
+        cell: Cell | None = self.switch.node.find(self.out.to)
+        return cell is not None and cell.state is DOWN and self.switch.homes.rejoin.next_lives.answers(cell)
 
     def drop(self) -> None:
         """Another ask stands in the place of this one, or the next program makes it again: it has no outcome here."""

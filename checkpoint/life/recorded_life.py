@@ -31,6 +31,7 @@ from ...actors.kernel.actor import Actor, Start
 from ...actors.kernel.cell import DOWN, RUNNING, Cell
 from ...actors.kernel.envelope import Item
 from ...actors.kernel.message import message_name
+from ...actors.kernel.node import cell_kind
 from ...actors.persistence import UNFIT
 from ...actors.state_hooks import StateMismatch, state_getter
 from ...actors.values import decode_value
@@ -437,9 +438,10 @@ class Life:
             self._leave(turn, reason)
 
     def _has_nobody(self, awaited: Awaited) -> bool:
-        """Whether it is an answer of somebody in this process who is between two lives."""
+        """Whether it is an answer of one of the runtime's actors in this process that is between two lives."""
         cell = self.cell.node.find(awaited.actor) if isinstance(awaited, Asked) else None
-        return cell is not None and cell.state is DOWN
+        kind = None if cell is None or cell.state is not DOWN else cell_kind(cell)
+        return kind is not None and kind._is_asked_again
 
     def _leave(self, turn: Suspended, reason: ExitReason) -> None:
         self.feed, self.outs = None, []  # What its handler says while it is cancelled does not count.

@@ -55,7 +55,8 @@ class Clerk(Doer):
             case "note":
                 return await at.ask(Note("hello"), timeout=TIME)
             case "pool":
-                return await self.ctx.find(f"{ASKED}/router", Kid).ask(Note("four"), timeout=TIME)
+                router: hf.ActorRef[Any] = self.ctx.find(f"{ASKED}/router", hf.Actor)
+                return await router.ask(Note("four"), timeout=TIME)
             case "size":
                 return (await at.ask(hf.supervision.PoolInfo(), timeout=TIME)).size
             case "route":

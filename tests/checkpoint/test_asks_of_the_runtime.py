@@ -46,7 +46,7 @@ def team(verb: str, asker: Any = "task", isolation: Any = "task", *, first: str 
         recovery=hf.hybrid(interval=3600.0),
         isolation="process" if asker == "process" else "task",
         shutdown=4 * IN_TIME,
-        **({"mechanism": hf.ftm.PBR()} if asker == "pbr" else {}),
+        mechanism=hf.ftm.PBR() if asker == "pbr" else None,
     )
     a = hf.supervisor("of-a", children=[clerk], isolation="process") if asker == "subtree" else clerk
     both = [a, asked(verb, isolation, options.pop("gate", None))]

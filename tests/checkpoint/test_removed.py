@@ -246,7 +246,7 @@ CHECKS = {
     ),
     "a turn that asks somebody between two lives is told so": Check(
         "checkpoint/home/outputs.py",
-        "        elif target.state is DOWN:",
+        "        elif target.state is DOWN and ask.has_nobody:",
         "        elif False:",
         RUNTIME,
         "next_life_answers and process and note",
