@@ -328,10 +328,12 @@ class Stranded(msgspec.Struct, array_like=True, tag=28):
     """Who is to answer what was asked as output (turn, k) has been stopped, and does so in its next life.
 
     A life that is to end does not wait for that: it leaves the turn to its own next life.
+    `is_over`: who is to answer lives again.
     """
 
     turn: int
     k: int
+    is_over: bool = False
 
 
 PastInputs = Outcome | Perform | SnapshotNow
@@ -463,6 +465,10 @@ class Waits(msgspec.Struct, array_like=True, tag=26):
     heard: int
 
 
+class Leaving(msgspec.Struct, array_like=True, tag=29):
+    """The life is to end behind the turn in hand: whose answers cannot come before that, it does not wait for."""
+
+
 class Unsaved(msgspec.Struct, array_like=True, tag=16):
     """The state could not be saved: no snapshot came of it."""
 
@@ -528,6 +534,7 @@ ToHome = (
     | Closed
     | Marked
     | Waits
+    | Leaving
 )
 
 

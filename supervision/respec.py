@@ -6,10 +6,12 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
-from ..actors.kernel.actor import Start
-from ..actors.kernel.cell import Cell
+from ..actors.kernel.actor import Actor, Start
+from ..actors.kernel.cell import DOWN, GONE, RUNNING, Cell
+from ..actors.kernel.node import Node
+from .children import STOPPED, STOPPING
 from .spec import ChildSpec, Flags
-from .supervisor import Supervisor
+from .supervisor import Supervisor, listed_at
 
 Change = Callable[[ChildSpec], ChildSpec]
 NO_RECIPE = (
@@ -139,6 +141,31 @@ def spec_below(start: Start[Any], names: list[str]) -> ChildSpec | None:
             return None
         start = spec.start
     return spec
+
+
+def to_come(node: Node, path: str) -> type[Actor] | None:
+    """The class of who is about to be started at an address, as a supervisor in this process has it; None: nobody is.
+
+    Whoever is up there already is not to come. Of a supervisor that ends, or was stopped by order, all below it are:
+    they come with its next life.
+    """
+    at = node.root
+    if at is None or not path.startswith(f"{at.path}/"):
+        return None
+    names = path[len(at.path) + 1 :].split("/")
+    while (listed := listed_at(at)) is not None:
+        one = listed.get(names.pop(0))
+        if one is None or (at.state is not RUNNING and not one.spec.comes_back):
+            return None
+        is_there = one.cell is not None and one.cell.state not in (DOWN, GONE)
+        if not names:
+            is_stopped = at.state is RUNNING and one.row is None and one.state in (STOPPED, STOPPING)
+            return None if is_there or is_stopped else one.spec.start.kind
+        if one.cell is None or listed_at(one.cell) is None:
+            spec = None if is_there and one.row is None else spec_below(one.spec.start, names)
+            return None if spec is None or not one.spec.comes_back else spec.start.kind
+        at = one.cell
+    return None
 
 
 def recipe_spec(cell: Cell) -> ChildSpec | None:

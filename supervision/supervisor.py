@@ -84,6 +84,7 @@ class Supervisor(Inquiries):
     """Keeps its children alive. Built by `supervisor(...)`, or derived from, with an `init` that returns a `Plan`."""
 
     _supervises: ClassVar[bool] = True
+    _is_asked_again = True
     _is_dynamic: ClassVar[bool] = False
     _with_successor = "anew"
 

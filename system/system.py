@@ -32,6 +32,7 @@ from ..actors.process.worker_pool import Workers
 from ..checkpoint.engine_calls import Called
 from ..checkpoint.home.homes import Homes
 from ..checkpoint.home.journal_home import JournalHome
+from ..checkpoint.home.next_lives import RuntimeAsks
 from ..checkpoint.journal import Journal, StaleEpoch, StoreEngine, StoreFailed
 from ..checkpoint.method import Durability
 from ..checkpoint.places.far_parent import FarParent
@@ -52,7 +53,7 @@ from ..cluster.silence import SilenceOfServers
 from ..supervision.admin import NoSuchChild, RemoveChild, StartChild
 from ..supervision.children import tell_stopped
 from ..supervision.patience import end_within, told_if_held
-from ..supervision.respec import respec
+from ..supervision.respec import respec, to_come
 from ..supervision.services.repeatable import bears_repetition
 from ..supervision.spec import ChildSpec, Flags
 from ..supervision.supervisor import Supervisor, kill_starting
@@ -254,7 +255,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
                 durability=options.durability,
                 file=file,
                 hooks=options.recovery_hooks,
-                bears_repetition=bears_repetition,
+                runtime=RuntimeAsks(bears_repetition, to_come),
             )
             self._specifications = Specifications(self._homes, is_kept=options.store is not None)
             self._mechanism_notes = MechanismNotes(self._homes)

@@ -157,6 +157,8 @@ class Actor:
     _with_successor: ClassVar[Literal["moved", "anew", "awaited"]] = "moved"
     """What becomes of it when another one takes its supervisor's place: it is moved there, or another one takes its own
     place, too, or its end is waited for."""
+    _is_asked_again: ClassVar[bool] = False
+    """Whether it answers for the runtime: what a recorded turn asks of it, and is not handled, is its next life's."""
     _is_part: ClassVar[bool] = False
     """Whether it is a part of the runtime: from another process only who was granted its address speaks to it."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -20,12 +21,27 @@ if TYPE_CHECKING:
     from ..kernel.node import Node
 
 
+class AboveStandIns(lifecycle.NearParent):
+    """Above stand-ins: their supervisor is in the process, and has said whether it ended with them.
+
+    Attributes:
+        ended: those that have ended with their supervisor, which may be started again.
+    """
+
+    def __init__(self) -> None:
+        self.ended = weakref.WeakSet[Cell]()
+
+    def is_restarting(self, cell: Cell) -> bool:
+        return cell in self.ended or super().is_restarting(cell)
+
+
 class Inner:
     """Stand-ins below the address of a process's own actor. They end with the process."""
 
     def __init__(self, node: Node, peer: Peer) -> None:
         self._node = node
         self._host = OutsideHost(peer)
+        self._host.parent = self._above = AboveStandIns()
         self._cells: dict[str, Cell] = {}
 
     def cells(self) -> Collection[Cell]:
@@ -148,6 +164,8 @@ class Inner:
         if cell is None:
             return
         cell.host.parent.leaves(is_restarting=with_parent)
+        if with_parent:
+            self._above.ended.add(cell)
         more = cell.extra()
         more.reason = reason
         for topic in list(more.belongings.topics):

@@ -26,6 +26,7 @@ from ..inputs import Batch, Input
 from ..protocol import AT_ITS_END, MESSAGE, Answer, Out, came
 from ..schema import shape_entry
 from .input_ledger import outcome_entry
+from .next_lives import NextLives, RuntimeAsks
 from .pending_asks import MARK, OVER, SwitchAsk, origin_of, since
 
 if TYPE_CHECKING:
@@ -582,11 +583,11 @@ class Rejoin:
     """All asks of a root that were under way when the one before it ended.
 
     Attributes:
-        bears_repetition: whether a message to somebody who keeps no journal leads to the same if it is handled twice.
+        next_lives: of those that keep no journal, and have been asked something.
     """
 
-    def __init__(self, homes: Homes, bears_repetition: Callable[[Codec, str, bytes], bool]) -> None:
-        self._homes, self.bears_repetition = homes, bears_repetition
+    def __init__(self, homes: Homes, runtime: RuntimeAsks) -> None:
+        self._homes, self.next_lives = homes, NextLives(homes, runtime)
         self._asks: dict[tuple[str, int, int, int], RejoinedAsk] = {}
         self._kept: dict[str, dict[str, KeptMessage]] = {}  # by address, and by who has told it in which output
 

@@ -27,11 +27,11 @@ from .ask_recovery import FarMail, Rejoin
 from .capacity import HomeBound
 from .disposal import Erased, Erasures, drop_all, forget_home, put_into_quarantine
 from .held_messages import Holding, end_wait, let_go
+from .next_lives import RuntimeAsks
 from .quarantine import Quarantine
 from .switch import Switch
 
 if TYPE_CHECKING:
-    from ...actors.kernel.codec import Codec
     from ...actors.kernel.mailbox import Bound
     from ...actors.kernel.node import Node
 
@@ -42,11 +42,6 @@ OPENED = "opened"
 """The fact that says when the root was begun whose fencing tokens were the largest: a whole number, of seconds."""
 TOKEN_BITS = 31
 """Of the part of a fencing token that counts within a second; in front of it are whole seconds."""
-
-
-def never_again(codec: Codec, name: str, body: bytes) -> bool:
-    """Say of every message that it may be handled only once."""
-    return False
 
 
 class Homes:
@@ -60,7 +55,7 @@ class Homes:
         durability: Durability | None = None,
         file: RecoveryFile | None = None,
         hooks: RecoveryHooks | None = None,
-        bears_repetition: Callable[[Codec, str, bytes], bool] = never_again,
+        runtime: RuntimeAsks | None = None,
     ) -> None:
         self.node = node
         self.journal = Commits(journal, node.loop, durability=durability or "os", emit=node.emit, where=f"/{node.name}")
@@ -80,7 +75,7 @@ class Homes:
         self._known = AddressTree(self._stored)  # with those at which somebody was started since
         self._noted = AddressTree(key.removeprefix(CHILDREN) for key in journal.notes(CHILDREN))  # children
         self.groups = Groups(self)
-        self.rejoin = Rejoin(self, bears_repetition)
+        self.rejoin = Rejoin(self, runtime or RuntimeAsks())
         self.far = FarMail(self)
         self.erasures = Erasures(self)
         node.on_rebound = self._rebound
@@ -414,6 +409,7 @@ class Homes:
         if not below:
             return
         self.addresses.absentees.dismissed(path)
+        self.rejoin.next_lives.dismissed(path)
         for waiting in self.known(path):
             if (switch := self._switches.get(waiting)) is not None:
                 end_wait(switch)
@@ -421,6 +417,7 @@ class Homes:
     def began(self, path: str, listed: Collection[str]) -> None:
         """The supervisor at `path` begins with these children: nobody else is brought back below it."""
         self.addresses.absentees.began(path, listed)
+        self.rejoin.next_lives.began(path, listed)
 
     def note(self, key: str, value: bytes | None) -> None:
         """Keep a small fact; None forgets it."""

@@ -83,17 +83,21 @@ class LedgerWaits:
         heard: how many outcomes it has.
         lasts: whether it has had effects or long waits: it goes on in the next life at its address.
         dues: until when outputs of it wait, in Unix time.
+        unasked: asks among them that surely nobody has handled: who was to was stopped with the program.
     """
 
     heard: int = 0
     lasts: bool = False
     dues: dict[tuple[int, int], float] = dataclasses.field(default_factory=dict)
+    unasked: set[tuple[int, int]] = dataclasses.field(default_factory=set)
 
     def end(self) -> None:
         """The turn in hand is over, or is to begin anew with nothing known of it."""
         self.heard, self.lasts = 0, False
         if self.dues:
             self.dues.clear()
+        if self.unasked:
+            self.unasked.clear()
 
 
 @dataclasses.dataclass(slots=True)
@@ -553,6 +557,7 @@ class InputLedger:
         if self.released:
             entries.append(self.released_entry(self.turn + 1))
         entries += [due_entry(*place, when) for place, when in self.waits.dues.items()]
+        entries += [("unasked", *place, True) for place in self.waits.unasked]
         # What was put aside once may have ended in a turn that was given up.
         ended = {turn.input.id for turn in self.turns.values() if turn.status != STASHED}
         entries += [("drop", key) for key in dict.fromkeys(self.ended_in_the_stash()) if key not in ended]
@@ -589,6 +594,10 @@ class InputLedger:
                 self.positions_of(turn).append(position)
                 if turn > self.turn:
                     self.waits.dues[turn, k], self.waits.lasts = when, True
+            case ("unasked", turn, k, is_so):
+                self.positions_of(turn).append(position)
+                if turn > self.turn:
+                    (self.waits.unasked.add if is_so else self.waits.unasked.discard)((turn, k))
             case ("got", turn, k, kind, name, body, *order):
                 self.positions_of(turn).append(position)
                 answer = Came(kind, name, body, *order)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from ...actors.control.trace_tail import enveloped, follow, with_tail
 from ...actors.errors import AskDeadlock, HoldfastError, MailboxFull
-from ...actors.kernel.cell import GONE, Cell
+from ...actors.kernel.cell import DOWN, GONE, Cell
 from ...actors.kernel.codec import Parcel
 from ...actors.kernel.envelope import Chain, waiters
 from ..durable_links import UNDONE_BY, connect
@@ -314,13 +314,15 @@ class Outputs:
         ask = self._made(turn, key, out, target)
         switch = switch_of(target)
         if switch is None:
-            batch.after.append(lambda: self._send_ask(key, target, ask))
+            batch.after.append(lambda: self.send_ask(key, target, ask))
         elif switch.waits(ask):
             ask.give(Answer(*home.node.codec.encode_error(AskDeadlock(out.to, waiters(ask.chain)))), batch)
         elif (bound := switch.intake.bound) is None or bound.makes_room(ask, out.name, out.body, home.path):
             self._record_ask(switch, ask, out, home.path, batch)
         if switch is not None and switch.intake.between is not None:
             batch.after.append(ask.strand)
+        elif target.state is DOWN and ask.has_nobody:
+            batch.after.append(ask.tell_stranded)
 
     def _made(self, turn: int, key: int, out: Out, target: Cell) -> SwitchAsk:
         """The ask that is an output of the turn in hand, which waits for it from now on."""
@@ -336,7 +338,17 @@ class Outputs:
     def ask_again(self, turn: int, key: int, out: Out) -> None:
         """Ask somebody who keeps no journal what was asked in an earlier program, and may be handled twice."""
         target = self._home.node.cell_at(out.to)
-        self._send_ask(key, target, self._made(turn, key, out, target))
+        self.send_ask(key, target, self._made(turn, key, out, target))
+
+    def made_again(self, ask: SwitchAsk) -> SwitchAsk:
+        """The same ask once more, with its whole time limit; the first one is over."""
+        assert ask.out is not None
+        ask.drop()
+        again = SwitchAsk.made(self._home, ask.turn, ask.out, ask.chain, ask.target, None)
+        again.since, again.doubt = ask.since, ask.doubt
+        self._home.calls.asks[ask.turn, ask.k] = again
+        self._home.node.deadlines.add(again)
+        return again
 
     def _record_ask(self, switch: Switch, ask: Ask, out: Out, sender: str | None, batch: Batch) -> None:
         """An ask to a recorded actor, up or not, is journaled in the same append."""
@@ -345,16 +357,19 @@ class Outputs:
         switch.awaits(asked, ask)
         batch.after.append(lambda: switch.admitted(asked))
 
-    def _send_ask(self, key: int, target: Cell, ask: SwitchAsk) -> None:
+    def send_ask(self, key: int, target: Cell, ask: SwitchAsk) -> None:
+        """Ask somebody who keeps no journal, or have that wait until somebody lives there."""
         home, target = self._home, target.living
         if ask.is_over:
             return
-        if target.state is GONE and 0 <= key < home.ledger.read:
+        if target.state is GONE and (0 <= key < home.ledger.read or home.homes.rejoin.next_lives.is_to_come(target)):
             # The input is from before the restart: whom it leads to may be started later, as before.
-            come = functools.partial(self._ask_soon, key, target, ask)
-            home.node.awaited.setdefault(target.path, []).append(come)
+            home.homes.rejoin.next_lives.wait(ask, target.path)
             return
         parcel: Any = ask.message
+        if target.state is not DOWN:
+            ask.unstrand()
+        home.calls.note_unasked(ask, is_so=False)
         try:
             ctx = target.ctx
             if ctx is not None and ctx._turn_in(ask.chain):
@@ -364,9 +379,6 @@ class Outputs:
             target.admit(target, ask)
         except HoldfastError as error:
             ask.fail(error)
-
-    def _ask_soon(self, key: int, target: Cell, ask: SwitchAsk) -> None:
-        self._home.node.loop.call_soon(self._send_ask, key, target, ask)  # Whoever comes there is not started yet.
 
     def _forward(self, turn: int, key: int, out: Out, batch: Batch) -> None:
         home = self._home

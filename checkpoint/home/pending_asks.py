@@ -8,9 +8,18 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from ...actors.errors import AskFailed, AskTimeout, BadMessage, BadReply, EffectInDoubt, HoldfastError, type_name
+from ...actors.errors import (
+    ActorStopped,
+    AskFailed,
+    AskTimeout,
+    BadMessage,
+    BadReply,
+    EffectInDoubt,
+    HoldfastError,
+    type_name,
+)
 from ...actors.events import EffectRepeated
-from ...actors.kernel.cell import Cell, TurnRest
+from ...actors.kernel.cell import DOWN, Cell, TurnRest
 from ...actors.kernel.codec import Parcel
 from ...actors.kernel.envelope import NO_DEADLINE, Ask, ReplyHandle
 from ...actors.process.wire.peer import RelayedAsk, asked
@@ -73,6 +82,9 @@ class SwitchAsk(RelayedAsk, eq=False):
     k: int = 0
     asked: str = ""  # the type of the message, if it is known
     since: int = 0  # when the message was admitted whose turn asks, in microseconds; 0: that is not known
+    out: Out | None = None
+    target: Any = None  # the Cell that was asked at first
+    doubt: HoldfastError | None = None  # why nobody knows whether a life that has ended had handled it
     is_stranded: bool = False  # who is to answer has been stopped, and does so in its next life
     settled: Callable[[], None] | None = None  # called when its outcome is safe
 
@@ -81,7 +93,7 @@ class SwitchAsk(RelayedAsk, eq=False):
         """The ask that was output (turn, k), of the turn that handles `source`."""
         ask = cls(Parcel(out.name, out.body), switch.cell, chain, out.seconds, NO_DEADLINE, None, to)
         ask.future, ask.switch, ask.asker, ask.turn, ask.k, ask.asked = ask, switch, switch.path, turn, out.k, out.name
-        ask.since = since(source)
+        ask.since, ask.out, ask.target = since(source), out, to
         return ask
 
     @property
@@ -110,18 +122,52 @@ class SwitchAsk(RelayedAsk, eq=False):
 
     def fail(self, error: BaseException) -> None:
         if not self.is_over:
+            if self._is_asked_again(error):
+                return
+            if self.doubt is not None and isinstance(error, ActorStopped):
+                error = self.doubt
             self.tell_failure(error)
         self.give(Answer(*self.codec.encode_error(error)))
 
     def fail_raw(self, kind: str, name: str, body: bytes) -> None:
         """Hand over an encoded error."""
+        if not self.is_over and self.out is not None:
+            error = self.codec.decode_error(kind, name, body, *asked(self))
+            if isinstance(error, (ActorStopped, AskFailed)):
+                self.fail(error)
+                return
         self.give(Answer(kind, name, body))
+
+    def _is_asked_again(self, error: BaseException) -> bool:
+        return self.out is not None and self.switch.homes.rejoin.next_lives.takes(self, error)
 
     def strand(self) -> None:
         """Who is to answer has been stopped, and does so in its next life: a turn that is told to stop is left then."""
         self.is_stranded = True
-        if self.switch is not None and not self.is_over and self.switch.life.port is not None:
-            self.switch.life.port.to_life(Stranded(self.turn, self.k))
+        self.tell_stranded()
+
+    def unstrand(self) -> None:
+        """Who is to answer is there again."""
+        if self.is_stranded:
+            self.is_stranded = False
+            self.tell_stranded(is_over=True)
+
+    def tell_stranded(self, *, is_over: bool = False) -> None:
+        """Tell the life that waits for it, if there is one, that nobody is there to answer, or that somebody is."""
+        if self.switch is not None and self.switch.life.port is not None:
+            self.switch.life.port.to_life(Stranded(self.turn, self.k, is_over))
+
+    @property
+    def has_nobody(self) -> bool:
+        """Whether nobody lives at the moment where it is to be answered, and whoever does next answers it."""
+        if self.is_stranded or self.out is None:
+            return self.is_stranded
+        cell: Cell | None = self.switch.node.find(self.out.to)
+        return cell is not None and cell.state is DOWN and self.switch.homes.rejoin.next_lives.answers(cell)
+
+    def drop(self) -> None:
+        """Another ask stands in the place of this one, or the next program makes it again: it has no outcome here."""
+        self.is_over, self.future = True, OVER
 
     def give(self, answer: Answer, batch: Batch | None = None) -> None:
         """Hand over the outcome, once."""
@@ -241,7 +287,7 @@ class PendingCalls:
             answer = None if (turn, k) in self.sends else ACCEPTED
         elif answer is None and (turn, k) not in self.asks and not home.homes.rejoin.joins(home, turn, key, out):
             # The root itself was restarted meanwhile, and whoever was asked keeps no journal.
-            if turn > home.ledger.turn and home.homes.rejoin.bears_repetition(home.node.codec, out.name, out.body):
+            if turn > home.ledger.turn and home.homes.rejoin.next_lives.may_be_asked(home, turn, out):
                 home.outputs.ask_again(turn, key, out)
                 return
             why = "the program was started again since, and what it had in hand was not recorded"
@@ -281,7 +327,22 @@ class PendingCalls:
 
     def stranded(self) -> list[int]:
         """Outputs of the turn in hand that are asks of somebody who has been stopped, and answers when it is back."""
-        return [k for (turn, k), ask in self.asks.items() if turn > self._home.ledger.turn and ask.is_stranded]
+        return [k for (turn, k), ask in self.asks.items() if turn > self._home.ledger.turn and ask.has_nobody]
+
+    def note_unasked(self, ask: SwitchAsk, *, is_so: bool) -> None:
+        """Have the next program know that surely nobody has handled an ask, or that from now on somebody may have."""
+        ledger, place, batch = self._home.ledger, (ask.turn, ask.k), Batch()
+        if ask.turn > ledger.turn and is_so is not (place in ledger.waits.unasked):
+            (ledger.waits.unasked.add if is_so else ledger.waits.unasked.discard)(place)
+            self._home.note(ask.turn, ("unasked", *place, is_so), batch)
+            batch.commit(self._home.journal)
+
+    def strand(self) -> None:
+        """The life is to end: the turn in hand does not wait for who is between two lives."""
+        for (turn, _), ask in list(self.asks.items()):
+            if turn > self._home.ledger.turn and ask.has_nobody:
+                ask.tell_stranded()
+                self._home.homes.rejoin.next_lives.rest(ask)
 
     def order(self, turn: int, out: Out) -> None:
         """Have the present life perform an effect: all that precedes it is safe."""

@@ -47,6 +47,7 @@ from ..protocol import (
     Go,
     Hooked,
     Ignored,
+    Leaving,
     Live,
     Marked,
     Out,
@@ -482,6 +483,8 @@ class Switch:
                     self.images.mark(record)
                 case Waits():
                     life.waits(record.heard)
+                case Leaving():
+                    self.calls.strand()
                 case Ignored():
                     life.fail(StartIgnored(self.path, record.why))
                 case Wanted() | Closed() | TurnEnd():

@@ -10,6 +10,8 @@ from ...actors.effects import EffectCall
 from ..durable_timers import said_by
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from ...actors.exit_reasons import ExitReason
     from ...actors.kernel.envelope import Item
     from ...actors.kernel.message import Message
@@ -173,11 +175,10 @@ class LifeWaits:
     stranded: frozenset[tuple[int, int]] = frozenset()
     heard: int = 0
 
-    @property
-    def are_stranded(self) -> bool:
+    def are_stranded(self, has_nobody: Callable[[Awaited], bool]) -> bool:
         """Whether all that the turn in hand waits for at home are answers that do not come before others live again."""
-        places = [place for place, (future, _) in self.outcomes.items() if not future.done()]
-        return bool(places) and self.stranded.issuperset(places)
+        left = [(place, awaited) for place, (future, awaited) in self.outcomes.items() if not future.done()]
+        return bool(left) and all(place in self.stranded or has_nobody(awaited) for place, awaited in left)
 
     @property
     def is_open(self) -> bool:

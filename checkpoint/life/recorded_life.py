@@ -28,9 +28,10 @@ from ...actors.events import RecordsMapped
 from ...actors.exit_reasons import ExitReason
 from ...actors.kernel import lifecycle, mailbox
 from ...actors.kernel.actor import Actor, Start
-from ...actors.kernel.cell import RUNNING, Cell
+from ...actors.kernel.cell import DOWN, RUNNING, Cell
 from ...actors.kernel.envelope import Item
 from ...actors.kernel.message import message_name
+from ...actors.kernel.node import cell_kind
 from ...actors.persistence import UNFIT
 from ...actors.state_hooks import StateMismatch, state_getter
 from ...actors.values import decode_value
@@ -52,6 +53,7 @@ from ..protocol import (
     Hooked,
     Ignored,
     Kept,
+    Leaving,
     Live,
     Out,
     Outcome,
@@ -219,7 +221,8 @@ class Life:
             case Perform():
                 self._perform(record)
             case Stranded():
-                self.waits.stranded |= {(record.turn, record.k)}
+                place = frozenset({(record.turn, record.k)})
+                self.waits.stranded = self.waits.stranded - place if record.is_over else self.waits.stranded | place
                 self.cell.node.loop.call_soon(self.leave_waiting)
             case Glance():  # Not here and now: this may be called in a turn of the very actor.
                 self.cell.node.loop.call_soon(answer_beside, self, record.feed)
@@ -421,6 +424,7 @@ class Life:
             return
         self.stage.stopping = reason
         self.cell.urge(StopRecorded(self, reason))
+        self.port.to_home(Leaving())
         self.leave_waiting()
 
     def leave_waiting(self) -> None:
@@ -428,10 +432,16 @@ class Life:
         reason, turn = self.stage.stopping, None if self.cell.more is None else self.cell.more.turn
         if reason is None or turn is None or turn.then is not None or turn.killed or self.feed is None:
             return
-        if self.is_live and self.method.replays and (self.waits.resting or self.waits.are_stranded):
+        if self.is_live and self.method.replays and (self.waits.resting or self.waits.are_stranded(self._has_nobody)):
             if self.word is not None:
                 self.word.mark(OVER)  # No end of this life is due to the turn.
             self._leave(turn, reason)
+
+    def _has_nobody(self, awaited: Awaited) -> bool:
+        """Whether it is an answer of one of the runtime's actors in this process that is between two lives."""
+        cell = self.cell.node.find(awaited.actor) if isinstance(awaited, Asked) else None
+        kind = None if cell is None or cell.state is not DOWN else cell_kind(cell)
+        return kind is not None and kind._is_asked_again
 
     def _leave(self, turn: Suspended, reason: ExitReason) -> None:
         self.feed, self.outs = None, []  # What its handler says while it is cancelled does not count.

@@ -41,6 +41,7 @@ _NAMES: Final[dict[str, tuple[str, ...]]] = {
     "ends": ("turn", "inputs"),
     "got": ("turn", "output", "outcome", "type", "value", "order", "after"),
     "due": ("turn", "output", "time"),
+    "unasked": ("turn", "output", "is_so"),
     "kept": ("origin", "type", "value", "sender"),
     "drop": ("input",),
     "tried": ("input", "deliveries"),

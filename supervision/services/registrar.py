@@ -214,6 +214,7 @@ class RegistryActor(Actor):
     """Keeps the book of one registry. Started by `registry(...)`, used through `Registry(ref)`."""
 
     deterministic = False
+    _is_asked_again = True
     _keeps_promises = True
 
     def __init__(self, keys: Keys, listeners: tuple[str, ...], meta: dict[str, Any]) -> None:

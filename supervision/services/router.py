@@ -39,6 +39,7 @@ class Router(Actor):
     """
 
     deterministic = False
+    _is_asked_again = True
     _with_successor = "anew"  # It is nothing without its supervisor beside it.
 
     def __init__(self, worker: Start[Any], routing: Routing, key: Key | None, restarting: Restarting) -> None:

@@ -27,6 +27,7 @@ BETWEEN = "tests/checkpoint/test_between_lives.py"
 ORDER = "tests/checkpoint/test_order.py"
 REGISTRY = "tests/supervision/test_registry_recorded.py"
 ORDERS = "tests/checkpoint/test_restart_orders.py"
+RUNTIME = "tests/checkpoint/test_asks_of_the_runtime.py"
 TO_THE_GONE = "tests/checkpoint/test_ties_to_the_gone.py"
 ONCE = "tests/checkpoint/test_orders_once.py"
 GIVEN_UP = "tests/checkpoint/test_given_up.py"
@@ -201,9 +202,65 @@ CHECKS = {
         REGISTRY,
         "ended_by_itself and hybrid",
     ),
+    "what a supervisor had in hand that has ended is asked again": Check(
+        "checkpoint/home/next_lives.py",
+        "if out is None or kind is None or not kind._is_asked_again:",
+        "if True:",
+        RUNTIME,
+        "under_way and restart",
+    ),
+    "what is asked of a registry that is to come waits for it": Check(
+        "checkpoint/home/next_lives.py",
+        "return kind is not None and kind._is_asked_again and self._lasts",
+        "return False",
+        RUNTIME,
+        "next_life_answers and restart and lookup",
+    ),
+    "without a store no ask waits for the next program": Check(
+        "checkpoint/home/next_lives.py",
+        "return self._homes.journal.durable or self._is_up",
+        "return True",
+        RUNTIME,
+        "without_a_store and lookup",
+    ),
+    "what was surely not handled is asked by the next program": Check(
+        "checkpoint/home/next_lives.py",
+        "            ask.switch.calls.note_unasked(ask, is_so=True)",
+        "            pass",
+        RUNTIME,
+        "next_program and any and not process",
+    ),
+    "whoever is forgotten with its supervisor is not waited for": Check(
+        "checkpoint/home/homes.py",
+        "        self.rejoin.next_lives.dismissed(path)\n",
+        "",
+        RUNTIME,
+        "nobody_comes_back and forgotten",
+    ),
+    "a life that is to end hears who is between two lives": Check(
+        "checkpoint/life/recorded_life.py",
+        "        self.port.to_home(Leaving())\n",
+        "",
+        RUNTIME,
+        "already and process",
+    ),
+    "a turn that asks somebody between two lives is told so": Check(
+        "checkpoint/home/outputs.py",
+        "        elif target.state is DOWN and ask.has_nobody:",
+        "        elif False:",
+        RUNTIME,
+        "next_life_answers and process and note",
+    ),
+    "whoever was stopped by order is not to come": Check(
+        "supervision/respec.py",
+        "return None if is_there or is_stopped else one.spec.start.kind",
+        "return None if is_there else one.spec.start.kind",
+        RUNTIME,
+        "nobody_comes_back and alone",
+    ),
     "what bears repetition is asked again by the next program": Check(
         "checkpoint/home/pending_asks.py",
-        "if turn > home.ledger.turn and home.homes.rejoin.bears_repetition(home.node.codec, out.name, out.body):",
+        "if turn > home.ledger.turn and home.homes.rejoin.next_lives.may_be_asked(home, turn, out):",
         "if False:",
         ORDERS,
         "end and task",
@@ -273,8 +330,8 @@ CHECKS = {
     ),
     "a stop ends a turn that comes to rest after it": Check(
         "checkpoint/life/recorded_life.py",
-        "(self.waits.resting or self.waits.are_stranded)",
-        "self.waits.are_stranded",
+        "(self.waits.resting or self.waits.are_stranded(self._has_nobody))",
+        "self.waits.are_stranded(self._has_nobody)",
         "tests/effects/test_long_waits.py",
         "before_the_turn_rests and call-effect",
     ),
@@ -399,14 +456,14 @@ CHECKS = {
     ),
     "a turn is left that waits for somebody who was stopped": Check(
         "checkpoint/home/pending_asks.py",
-        "        if self.switch is not None and not self.is_over and self.switch.life.port is not None:\n",
+        "        if self.switch is not None and self.switch.life.port is not None:\n",
         "        if False:\n",
         BETWEEN,
         "test_who_waits_for_it_does_not_hold_up_the_stop and task and then",
     ),
     "and only when nothing else is out that it waits for": Check(
         "checkpoint/life/life_state.py",
-        "return bool(places) and self.stranded.issuperset(places)",
+        "return bool(left) and all(place in self.stranded or has_nobody(awaited) for place, awaited in left)",
         "return bool(self.stranded)",
         BETWEEN,
         "test_an_effect_that_is_out_is_waited_for",
@@ -693,8 +750,8 @@ CHECKS = {
     ),
     "what was told before the restart asks whoever is started later": Check(
         "checkpoint/home/outputs.py",
-        "        if target.state is GONE and 0 <= key < home.ledger.read:\n",
-        "        if False:\n",
+        "(0 <= key < home.ledger.read or home.homes.rejoin.next_lives.is_to_come(target))",
+        "home.homes.rejoin.next_lives.is_to_come(target)",
         "tests/checkpoint/test_restart_unrecorded.py",
         "test_what_was_told_before",
     ),
