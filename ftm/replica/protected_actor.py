@@ -204,8 +204,8 @@ class Server(lifecycle.HerePlace):
     def _life_ended(self, life: ServerLife, reason: ExitReason) -> None:
         self.life = None
         self._note_work(life)
-        is_failure = self.state.is_stopping or self.attempts.failed is not None
-        if not is_failure and reason.is_clean and life.stage.ignored_why is None:
+        is_failure, has_said = self.state.is_stopping or self.attempts.failed is not None, life.stage.ending is not None
+        if not is_failure and (reason.is_clean or has_said) and life.stage.ignored_why is None:
             self.state.is_over = True
             self.tell_more(Closed(0, pack_exit(reason), False))
         is_missed = not (is_failure or self._rest.is_awaited or self.state.is_over)

@@ -33,6 +33,27 @@ GIVEN_UP = "tests/checkpoint/test_given_up.py"
 WITHDRAWN = "tests/checkpoint/test_withdrawn.py"
 
 CHECKS = {
+    "a process that speaks for an actor lets out its turn's orders to itself": Check(
+        "checkpoint/home/life_ports.py",
+        "elif out.verb in ORDERS and not gate.speaks_for(out.to):\n",
+        "elif out.verb in ORDERS:\n",
+        ONCE,
+        "ends_its_actor_once and tr",
+    ),
+    "an end that a turn has said is one, whatever its reason": Check(
+        "ftm/replica/protected_actor.py",
+        "(reason.is_clean or has_said)",
+        "reason.is_clean",
+        ONCE,
+        "ends_its_actor_once and tr",
+    ),
+    "a life at the root below a process ends for the reason that its process has ended for": Check(
+        "checkpoint/places/far_parent.py",
+        "noticed=noticed, reason=reason, recovers=recovers\n",
+        "noticed=noticed, recovers=recovers\n",
+        ONCE,
+        "stop_behind_a_crash and subtree",
+    ),
     "an image that its life has given up is no failure": Check(
         "checkpoint/snapshot/snapshot_blocks.py",
         "            if self._is_missed:\n",
