@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 from typing import TYPE_CHECKING, Any
 
 from ..errors import ControlFailed, HoldfastError, error_text, type_name
@@ -101,10 +102,16 @@ class QueuedOrder(Item):
 
     def runs_beside(self, cell: Cell) -> bool:
         """Whether it was obeyed just now, beside the turn that waits."""
-        if not self.order.is_beside or cell.actor is None or cell.more is None or cell.more.turn is None:
+        if cell.actor is None or cell.more is None or cell.more.turn is None:
             return False
-        QueuedOrder.run(cell.actor, self)
-        return True
+        if self.order.is_beside:
+            QueuedOrder.run(cell.actor, self)
+        elif self.order.is_look and cell.ctx is not None:
+            seen = cell.ctx._look_beside(functools.partial(self.order.run, cell, cell.actor))
+            if seen is None:
+                return False
+            self.give(seen[0])
+        return self.order.is_beside or self.order.is_look
 
 
 def answer_bytes(value: object, path: str, verb: str) -> bytes:

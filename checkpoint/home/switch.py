@@ -54,6 +54,7 @@ from ..protocol import (
     PipeDone,
     Released,
     Restore,
+    Retried,
     Snapshot,
     ToHome,
     TurnEnd,
@@ -470,6 +471,8 @@ class Switch:
                     self.outputs.work_done(record)
                 case Performed():
                     self.calls.performed(record)
+                case Retried():
+                    self.calls.retried(record)
                 case GivenUp():
                     self.calls.give_up(record)
                 case Glanced():

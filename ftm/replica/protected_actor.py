@@ -43,6 +43,7 @@ from ...checkpoint.protocol import (
     PipeDone,
     Released,
     Restore,
+    Retried,
     Snapshot,
     SnapshotNow,
     ToHome,
@@ -113,7 +114,7 @@ class Driver(Protocol):
         """See to it that what waits to go home is taken."""
         ...
 
-    def tell_outward(self, record: Released | Performed | GivenUp) -> None:
+    def tell_outward(self, record: Released | Performed | Retried | GivenUp) -> None:
         """Something leaves in the middle of a turn."""
         ...
 
@@ -1042,7 +1043,7 @@ class Server(lifecycle.HerePlace):
                     if record.status == FAILED:
                         self.attempts.failed = record.id
                 self.part.ends.append(record)
-            case Released() | Performed() | GivenUp():
+            case Released() | Performed() | Retried() | GivenUp():
                 if self._driver is not None:
                     self._driver.tell_outward(record)
             case Live():
