@@ -708,6 +708,11 @@ class ActorContext:
         """Leave the turn in hand, if it rests (for days, perhaps) and the next life runs it again from its start."""
         return False
 
+    @property
+    def _is_open(self) -> bool:
+        """Whether the state can be looked at beside the turn in hand, which rests."""
+        return False
+
     def _look_beside(self, look: Callable[[], object]) -> tuple[object] | None:
         """What is seen of the state in the middle of the turn in hand; None: that does not rest, and is waited for."""
         return None

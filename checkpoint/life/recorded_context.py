@@ -577,6 +577,10 @@ class RecordedContext(ActorContext):
         turn.runner.task.cancel()
         return True
 
+    @property
+    def _is_open(self) -> bool:
+        return self.recorded.is_live and self.recorded.waits.is_open
+
     def _look_beside(self, look: Callable[[], object]) -> tuple[object] | None:
         return seen_beside(self.recorded, self.recorded.feed, look)
 

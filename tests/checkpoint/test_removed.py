@@ -29,10 +29,25 @@ REGISTRY = "tests/supervision/test_registry_recorded.py"
 ORDERS = "tests/checkpoint/test_restart_orders.py"
 TO_THE_GONE = "tests/checkpoint/test_ties_to_the_gone.py"
 ONCE = "tests/checkpoint/test_orders_once.py"
+ATTEMPTS = "tests/effects/test_failed_attempts.py"
 GIVEN_UP = "tests/checkpoint/test_given_up.py"
 WITHDRAWN = "tests/checkpoint/test_withdrawn.py"
 
 CHECKS = {
+    "a state is looked at beside a turn that rests, and not in the turn of whoever asks": Check(
+        "actors/control/orders_lane.py",
+        "        cell.node.loop.call_soon(self._look, cell)  # Not here and now: this may be called in a turn.\n",
+        "        self._look(cell)\n",
+        ATTEMPTS,
+        "test_the_state_beside and task",
+    ),
+    "what a home knows of a turn is known of one behind a mechanism, too": Check(
+        "system/controls.py",
+        "there, names = known_at_home(told, cell), (",
+        "there, names = told, (",
+        ATTEMPTS,
+        "test_whoever_looks and pbr",
+    ),
     "a process that speaks for an actor lets out its turn's orders to itself": Check(
         "checkpoint/home/life_ports.py",
         "elif out.verb in ORDERS and not gate.speaks_for(out.to):\n",
