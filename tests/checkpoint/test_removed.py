@@ -34,13 +34,6 @@ GIVEN_UP = "tests/checkpoint/test_given_up.py"
 WITHDRAWN = "tests/checkpoint/test_withdrawn.py"
 
 CHECKS = {
-    "a state is looked at beside a turn that rests, and not in the turn of whoever asks": Check(
-        "actors/control/orders_lane.py",
-        "        cell.node.loop.call_soon(self._look, cell)  # Not here and now: this may be called in a turn.\n",
-        "        self._look(cell)\n",
-        ATTEMPTS,
-        "test_the_state_beside and task",
-    ),
     "what a home knows of a turn is known of one behind a mechanism, too": Check(
         "system/controls.py",
         "there, names = known_at_home(told, cell), (",
