@@ -8,7 +8,7 @@ import functools
 import random
 from collections.abc import Awaitable, Callable
 from contextvars import ContextVar
-from typing import Any, Literal, TypeAlias
+from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
 import msgspec
 
@@ -48,6 +48,9 @@ ONCE = Retry(attempts=1)
 
 Isolation: TypeAlias = Literal["thread", "process"]
 """Where the plain function of an effect runs."""
+
+LONGEST_LINE: Final = 200
+"""Characters of what an attempt has raised."""
 
 _token: ContextVar[int] = ContextVar("fencing_token", default=0)
 """While an effect is performed: the fencing token of the life that performs it."""
@@ -92,6 +95,22 @@ def fencing_token() -> int:
     return token
 
 
+class FailedAttempt(NamedTuple):
+    """An attempt of an effect that has failed, and is followed by another one.
+
+    Attributes:
+        number: which attempt it was, from 1.
+        most: how many there may be.
+        error: what it has raised, in a line.
+        seconds: from its end to the next one.
+    """
+
+    number: int
+    most: int
+    error: str
+    seconds: float
+
+
 class EffectCall(msgspec.Struct, frozen=True, eq=False):
     """One effect of a turn: the function, and how it is attempted.
 
@@ -114,7 +133,14 @@ class EffectCall(msgspec.Struct, frozen=True, eq=False):
     is_async: bool
     isolation: Isolation
 
-    async def perform(self, path: str, run: Callable[..., Awaitable[Any]], seed: int, token: int) -> object:
+    async def perform(
+        self,
+        path: str,
+        run: Callable[..., Awaitable[Any]],
+        seed: int,
+        token: int,
+        failed: Callable[[FailedAttempt], None],
+    ) -> object:
         """Attempt it until it succeeds or has failed, and return what it returns. It is awaited in a task of its own.
 
         Args:
@@ -122,6 +148,7 @@ class EffectCall(msgspec.Struct, frozen=True, eq=False):
             run: runs a function with its arguments in a thread or a process.
             seed: of the jitter of the back-off.
             token: the fencing token of the life that performs it.
+            failed: is told of each attempt that is followed by another one.
 
         Raises:
             EffectFailed: the last attempt has raised, or has taken too long, or its process has ended.
@@ -155,7 +182,19 @@ class EffectCall(msgspec.Struct, frozen=True, eq=False):
                 if attempt >= self.retry.attempts or not is_one_of(error, self.retry.on):
                     raise EffectFailed(self.key, attempt, kind, text) from error
             numbers = numbers or random.Random(seed)
-            await asyncio.sleep(self.retry.backoff.delay(attempt - 1, numbers))
+            delay = self.retry.backoff.delay(attempt - 1, numbers)
+            failed(FailedAttempt(attempt, self.retry.attempts, said_shortly(kind, text), delay))
+            await asyncio.sleep(delay)
+
+
+def said_shortly(kind: str, text: str) -> str:
+    """An error in a line.
+
+    >>> said_shortly("OSError", "no route\\nto the card network"), said_shortly("TimeoutError", "")
+    ('OSError: no route', 'TimeoutError')
+    """
+    first = text.split("\n", 1)[0]
+    return f"{kind}: {first[:LONGEST_LINE]}" if first else kind
 
 
 def is_one_of(error: BaseException, kinds: tuple[type[Exception], ...]) -> bool:

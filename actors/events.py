@@ -311,6 +311,19 @@ class EffectRepeated(Event, frozen=True, eq=False):
     message: str
 
 
+class EffectRetried(Event, frozen=True, eq=False):
+    """An attempt of an effect has failed, and is followed by another one.
+
+    Attempt `number` of at most `most` has raised `error`; the next one begins in `seconds`. `effect` is its key.
+    """
+
+    effect: str
+    number: int
+    most: int
+    error: str
+    seconds: float
+
+
 class ReplayPaced(Event, frozen=True, eq=False):
     """A replay that waits between messages: `turns` are still to be fed, and the last is due in `seconds`.
 

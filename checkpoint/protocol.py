@@ -15,6 +15,7 @@ from typing import Annotated, Any, TypeAlias
 
 import msgspec
 
+from ..actors.effects import FailedAttempt
 from ..actors.exit_reasons import ExitReason, unpack_exit
 from ..actors.kernel.cell import GivenName
 from ..actors.kernel.mailbox import Bounded
@@ -445,6 +446,14 @@ class Performed(msgspec.Struct, array_like=True, tag=23):
     answer: Answer
 
 
+class Retried(msgspec.Struct, array_like=True, tag=29):
+    """An attempt of the effect that was output (turn, k) has failed, and is followed by another one."""
+
+    turn: int
+    k: int
+    attempt: FailedAttempt
+
+
 class GivenUp(msgspec.Struct, array_like=True, tag=27):
     """The turn does not wait any more for what comes of its output (turn, k), and has not got it."""
 
@@ -527,6 +536,7 @@ ToHome = (
     | Snapshot
     | PipeDone
     | Performed
+    | Retried
     | GivenUp
     | Glanced
     | Unsaved

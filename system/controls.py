@@ -227,10 +227,10 @@ class Controls:
         if worker is None or not cell.host.work(cell).is_in_turn:
             return own
         try:
-            there = await ask_status(worker, cell, min(timeout, STATUS_WITHIN), place.known_as(cell))
+            told = await ask_status(worker, cell, min(timeout, STATUS_WITHIN), place.known_as(cell))
         except (ActorStopped, AskFailed, AskTimeout):  # Another one leads soon.
             return own
-        names = ("turn", "turn_seconds", "turn_at", "turn_rests")
+        there, names = known_at_home(told, cell), ("turn", "turn_seconds", "turn_at", "turn_rests")
         return dataclasses.replace(own, **{name: getattr(there, name) for name in names})
 
     async def protection(self, target: Target, *, timeout: float = DEFAULT_TIMEOUT) -> ProtectionStatus:

@@ -38,6 +38,8 @@ class Order:
     verb: ClassVar[str]
     is_beside: ClassVar[bool] = False
     """Whether it is obeyed in the middle of a turn that waits, too."""
+    is_look: ClassVar[bool] = False
+    """Whether it only looks at the state: it is obeyed beside a turn that rests, as an ask that changes nothing is."""
     is_change: ClassVar[bool] = False
     """Whether turns are not run behind it as they would have been: it is not obeyed ahead of one that had begun."""
 
@@ -77,6 +79,7 @@ class GetState(Order):
     """A copy of the state."""
 
     verb = "get_state"
+    is_look = True
 
     def run(self, cell: Cell, actor: Actor) -> Any:
         return state_to_show(actor)
@@ -86,6 +89,7 @@ class OutlineState(Order):
     """A short text of each variable of the state, however large it is."""
 
     verb = "outline"
+    is_look = True
 
     def run(self, cell: Cell, actor: Actor) -> dict[str, str]:
         return outline_of(actor)

@@ -54,12 +54,12 @@ class OrderAsk(Ask, eq=False):
 class QueuedOrder(Item):
     """An order in the queue of its actor: a command, ahead of all messages (but for `Mark`)."""
 
-    __slots__ = ("ask", "order")
+    __slots__ = ("ask", "has_looked", "order")
     of_life = False
     comes_again = True
 
     def __init__(self, ask: Ask, order: Order) -> None:
-        self.ask, self.order = ask, order
+        self.ask, self.order, self.has_looked = ask, order, False
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
@@ -100,11 +100,30 @@ class QueuedOrder(Item):
         return type(self.order) is not Mark
 
     def runs_beside(self, cell: Cell) -> bool:
-        """Whether it was obeyed just now, beside the turn that waits."""
-        if not self.order.is_beside or cell.actor is None or cell.more is None or cell.more.turn is None:
+        """Whether it is obeyed beside the turn that waits: just now, or, if it looks at the state, soon."""
+        if cell.actor is None or cell.more is None or cell.more.turn is None:
             return False
-        QueuedOrder.run(cell.actor, self)
+        if self.order.is_beside:
+            QueuedOrder.run(cell.actor, self)
+            return True
+        if not self.order.is_look or self.has_looked or cell.ctx is None or not cell.ctx._is_open:
+            return False
+        self.has_looked = True
+        cell.node.loop.call_soon(self._look, cell)  # Not here and now: this may be called in a turn.
         return True
+
+    def _look(self, cell: Cell) -> None:
+        """Look at the state beside the turn that rests; if it does not any more, behind it."""
+        ctx, actor = cell.ctx, cell.actor
+        if self.ask.is_done:
+            return
+        seen = None if ctx is None or actor is None else ctx._look_beside(lambda: self.order.run(cell, actor))
+        if seen is not None:
+            self.give(seen[0])
+        elif cell.is_dead:
+            self.undelivered(cell, "it has ended")
+        else:
+            cell.host.control(cell, self)
 
 
 def answer_bytes(value: object, path: str, verb: str) -> bytes:

@@ -21,6 +21,7 @@ from .ref import ActorRef
 
 if TYPE_CHECKING:
     from ..control.tracing import TurnTap
+    from ..effects import FailedAttempt
     from ..errors import StartFailed
     from .actor import Actor, Start
     from .address_host import Capacity, Home, Parent, Place, QueuedOrder, Work
@@ -177,12 +178,24 @@ class TurnRest(NamedTuple):
         name: of an effect its key, of a wait the classes of messages; "" for a sleep.
         since: when it began, in Unix time.
         until: when it ends at the latest, in Unix time; None: that is not known.
+        failed: of an effect, how many attempts have failed.
+        attempts: how many there may be.
+        error: what the last one has raised, in a line.
+        again: when the next one begins, or has begun, in Unix time.
     """
 
     kind: Literal["sleep", "effect", "wait"]
     name: str
     since: float
     until: float | None = None
+    failed: int = 0
+    attempts: int = 0
+    error: str = ""
+    again: float = 0.0
+
+    def after(self, failed: FailedAttempt, now: float) -> TurnRest:
+        """The same, when an attempt of the effect has failed at this moment, in Unix time."""
+        return self._replace(failed=failed.number, attempts=failed.most, error=failed.error, again=now + failed.seconds)
 
     def said(self, now: float) -> str:
         """It in words, behind whoever waits; `now` is Unix time.
@@ -192,12 +205,27 @@ class TurnRest(NamedTuple):
         """
         seconds = now - self.since
         if self.kind == "effect":
-            return f"waits for the effect {self.name}, which has been out for {seconds:.1f} s"
+            return f"waits for the effect {self.name}, which has been out for {seconds:.1f} s{self._tried(now)}"
         if self.kind == "wait":
             said = f"has waited for {seconds:.1f} s for {self.name}"
             return said if self.until is None else f"{said}, until {_moment(self.until, now)} at the latest"
         said = f"has slept for {seconds:.1f} s"
         return said if self.until is None else f"{said}, and sleeps until {_moment(self.until, now)}"
+
+    def _tried(self, now: float) -> str:
+        """What is known of its attempts, in brackets; "" if none has failed.
+
+        >>> rest = TurnRest("effect", "pay", 10.0, None, 6, 100, "OSError: no network", 15.0)
+        >>> rest._tried(11.8)
+        ' (attempt 6 of 100: OSError: no network; the next in 3.2 s)'
+        >>> rest._tried(15.5)
+        ' (attempt 7 of 100; the last: OSError: no network)'
+        """
+        if not self.failed:
+            return ""
+        if now < self.again:
+            return f" (attempt {self.failed} of {self.attempts}: {self.error}; the next in {self.again - now:.1f} s)"
+        return f" (attempt {self.failed + 1} of {self.attempts}; the last: {self.error})"
 
 
 def _moment(at: float, now: float) -> str:

@@ -14,8 +14,9 @@ from contextvars import ContextVar, copy_context
 from types import CodeType, FrameType
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, TypeVar, TypeVarTuple, cast, overload
 
-from ..effects import EffectCall, Isolation, Retry, effect_of
+from ..effects import EffectCall, FailedAttempt, Isolation, Retry, effect_of
 from ..errors import ActorStopped, AskDeadlock, HoldfastError, SpecError, remote_crash
+from ..events import EffectRetried
 from ..exit_reasons import NORMAL, ExitReason
 from ..seconds import check_seconds
 from . import links, mailbox
@@ -465,13 +466,22 @@ class ActorContext:
     def _performed(self, effect: EffectCall) -> asyncio.Future[object]:
         """The outcome of an effect: without recovery, whatever it comes to now."""
         self._token = self._token or self._cell.node.numbers.next_token()
-        return self._resting(self._perform(effect), "effect", effect.key, None)
 
-    def _perform(self, effect: EffectCall) -> Coroutine[Any, Any, object]:
+        def failed(attempt: FailedAttempt) -> None:
+            cell, rests = self._cell, self._cell.extra().belongings.rests
+            if rests is not None and task in rests:
+                item, rest = rests[task]
+                rests[task] = item, rest.after(attempt, cell.node.clock.wall())
+                cell.node.emit(EffectRetried(self.path, effect.key, *attempt))
+
+        task = self._resting(self._perform(effect, failed), "effect", effect.key, None)
+        return task
+
+    def _perform(self, effect: EffectCall, failed: Callable[[FailedAttempt], None]) -> Coroutine[Any, Any, object]:
         """Perform it here and now."""
         node = self._cell.node
         run = node.threads.run if effect.isolation == "thread" else node.ports.run_in_process
-        return effect.perform(self.path, run, node.numbers.next_seed(), self._token)
+        return effect.perform(self.path, run, node.numbers.next_seed(), self._token, failed)
 
     def sleep_until(self, when: float) -> asyncio.Future[None]:
         """Have the turn in hand wait until a moment, be it days away.
@@ -697,6 +707,15 @@ class ActorContext:
     def _leaves_turn(self) -> bool:
         """Leave the turn in hand, if it rests (for days, perhaps) and the next life runs it again from its start."""
         return False
+
+    @property
+    def _is_open(self) -> bool:
+        """Whether the state can be looked at beside the turn in hand, which rests."""
+        return False
+
+    def _look_beside(self, look: Callable[[], object]) -> tuple[object] | None:
+        """What is seen of the state in the middle of the turn in hand; None: that does not rest, and is waited for."""
+        return None
 
     def _postpones(self, call: Item) -> bool:
         """Whether an order has to wait (a journaled actor takes none before it has caught up); it comes again then."""

@@ -69,7 +69,7 @@ def require_outputs(gate: WorkerGate, record: object) -> None:
     for out in outputs_of(record):
         if out.verb in SENT:
             gate.output(out.to, out.name)
-        elif out.verb in ORDERS:
+        elif out.verb in ORDERS and not gate.speaks_for(out.to):
             gate.order(out.to, out.verb)
 
 

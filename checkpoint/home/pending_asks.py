@@ -18,7 +18,7 @@ from ...actors.errors import (
     HoldfastError,
     type_name,
 )
-from ...actors.events import EffectRepeated
+from ...actors.events import EffectRepeated, EffectRetried
 from ...actors.kernel.cell import DOWN, Cell, TurnRest
 from ...actors.kernel.codec import Parcel
 from ...actors.kernel.envelope import NO_DEADLINE, Ask, ReplyHandle
@@ -36,6 +36,7 @@ from ..protocol import (
     Outcome,
     Perform,
     Performed,
+    Retried,
     Stranded,
     came,
     timed,
@@ -352,6 +353,8 @@ class PendingCalls:
                 self.long.clear()
                 self.effects.clear()  # An earlier turn has ended without waiting for them.
             self.effects[place] = TurnRest("effect", out.to, self._home.node.clock.wall())
+        elif self.effects[place].failed:
+            self.effects[place] = TurnRest("effect", out.to, self.effects[place].since)
         if self._home.life.port is not None:
             self._home.life.port.to_life(Perform(turn, out.k, self._home.life.token))
         self.long.discard(place)
@@ -373,6 +376,14 @@ class PendingCalls:
         is_out = ledger.turn < record.turn and ledger.digest_of(*place) and place not in ledger.outcomes
         if is_out and place not in self.asks:
             self.outcome(*place, timed(record.answer, self._home.node.clock.wall()), None)
+
+    def retried(self, record: Retried) -> None:
+        """An attempt of an effect of the turn in hand has failed, and is followed by another one."""
+        place, home = (record.turn, record.k), self._home
+        if place in self.effects:
+            rest = self.effects[place]
+            self.effects[place] = rest.after(record.attempt, home.node.clock.wall())
+            home.node.emit(EffectRetried(home.path, rest.name, *record.attempt))
 
     def give_up(self, record: GivenUp) -> None:
         """The turn in hand does not want any more what it waits for: no later life of it gets that either.

@@ -55,6 +55,7 @@ from ..protocol import (
     PipeDone,
     Released,
     Restore,
+    Retried,
     Snapshot,
     ToHome,
     TurnEnd,
@@ -471,6 +472,8 @@ class Switch:
                     self.outputs.work_done(record)
                 case Performed():
                     self.calls.performed(record)
+                case Retried():
+                    self.calls.retried(record)
                 case GivenUp():
                     self.calls.give_up(record)
                 case Glanced():

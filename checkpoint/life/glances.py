@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import types
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from ...actors.errors import type_name
 from ...actors.kernel.envelope import ReplyHandle
@@ -16,6 +17,9 @@ if TYPE_CHECKING:
     from ...actors.kernel.cell import Cell
     from ...actors.kernel.ref import ActorRef
     from .recorded_life import Life
+
+
+T = TypeVar("T")
 
 
 class NeedsTurn(BaseException):
@@ -67,13 +71,23 @@ def answer_beside(life: Life, feed: Feed) -> None:
 
     Else nothing has happened, and it waits for its turn as everything else; so does what raises.
     """
+    if life.cell.more is not None and life.cell.more.suspended:
+        return
+    seen = seen_beside(life, feed, lambda: _answered(life, feed))
+    if seen is not None:
+        life.drop_queued(feed.id)
+        life.port.to_home(Glanced(feed.id, seen[0]))
+
+
+def seen_beside(life: Life, feed: Feed | None, look: Callable[[], T]) -> tuple[T] | None:
+    """What is seen beside the turn in hand, if that waits, for whoever asks by `feed`; None: nothing has happened."""
     cell, context = life.cell, life.cell.context
     more, actor = cell.more, cell.actor
     turn = None if more is None else more.turn
     if life.stage.is_over or not life.is_live or not life.waits.is_open or context is None or actor is None:
-        return
-    if more is None or turn is None or turn.killed or turn.then is not None or more.suspended:
-        return
+        return None
+    if feed is None or turn is None or turn.killed or turn.then is not None:
+        return None
     standing: Any = GlanceContext(cell, life, feed)
     context, ctx = context.copy(), actor.ctx
     context.run(current.set, standing)
@@ -82,15 +96,13 @@ def answer_beside(life: Life, feed: Feed) -> None:
     if life.word is not None:
         life.word.look(feed.id)  # If the process dies of it.
     try:
-        answer = cell.node.step_beside(context, lambda: _answered(life, feed))
+        return (cell.node.step_beside(context, look),)
     except BaseException:  # Whatever user code raises: it does so again in its turn, which is judged as any other.
-        return
+        return None
     finally:
         actor.ctx = ctx
         if life.word is not None:
             life.word.mark(how)
-    life.drop_queued(feed.id)
-    life.port.to_home(Glanced(feed.id, answer))
 
 
 def _answered(life: Life, feed: Feed) -> Answer:

@@ -12,7 +12,7 @@ import msgspec
 
 from ...actors.control.orders import Suspend
 from ...actors.control.orders_lane import QueuedOrder
-from ...actors.effects import EffectCall
+from ...actors.effects import EffectCall, FailedAttempt
 from ...actors.errors import (
     BadMessage,
     BadReply,
@@ -36,8 +36,9 @@ from ...actors.kernel.timers import Timer
 from ...actors.seconds import check_seconds
 from ...actors.values import encode_value
 from ...actors.values.saved_refs import SavedHandle
-from ..protocol import REPLY, SINCE_THEN, Answer, EndWanted, Feed, Perform, Performed, PipeDone
+from ..protocol import REPLY, SINCE_THEN, Answer, EndWanted, Feed, Perform, Performed, PipeDone, Retried
 from ..turn_word import WAITS
+from .glances import seen_beside
 from .life_state import Asked
 from .recorded_inbox import INIT, STARTED, Fed
 
@@ -472,8 +473,13 @@ class RecordedContext(ActorContext):
 
     async def _carried_out(self, turn: int, k: int, effect: EffectCall) -> None:
         life = self.recorded
+
+        def failed(attempt: FailedAttempt) -> None:
+            if not self._closed and (turn, k) in life.waits.outcomes:
+                life.port.to_home(Retried(turn, k, attempt))
+
         try:
-            value = await self._perform(effect)
+            value = await self._perform(effect, failed)
             answer = Answer(REPLY, "", encode_value(value, where=f"the result of {effect.key}"))
         except Exception as error:
             answer = self._kept(effect, error)
@@ -570,6 +576,13 @@ class RecordedContext(ActorContext):
         turn.is_left = True
         turn.runner.task.cancel()
         return True
+
+    @property
+    def _is_open(self) -> bool:
+        return self.recorded.is_live and self.recorded.waits.is_open
+
+    def _look_beside(self, look: Callable[[], object]) -> tuple[object] | None:
+        return seen_beside(self.recorded, self.recorded.feed, look)
 
     def _postpones(self, call: Item) -> bool:
         if self._is_adrift and isinstance(call, QueuedOrder):

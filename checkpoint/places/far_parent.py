@@ -223,7 +223,9 @@ class FarParent(Parent):
         if cell is None or cell.state is not RUNNING:
             return
         recovers = recovers and home.recovers(reason)
-        home.over(cell, running, str(reason), ordered=ordered, noticed=noticed, recovers=recovers)
+        home.over(
+            cell, running, str(reason), ordered=ordered, noticed=noticed, reason=reason, recovers=recovers
+        )  # fmt: skip
         _tell_end(cell, reason, recovers=recovers)
 
     def _end_unwanted(self, reason: ExitReason, *, recovers: bool) -> None:

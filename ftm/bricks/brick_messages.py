@@ -18,6 +18,7 @@ from ...checkpoint.protocol import (
     Performed,
     PipeDone,
     Released,
+    Retried,
     Snapshot,
     TurnEnd,
     Unsaved,
@@ -210,7 +211,7 @@ class Outward(Message):
     and what its effects have come to."""
 
     epoch: int
-    records: list[Released | Performed | GivenUp]
+    records: list[Released | Performed | Retried | GivenUp]
 
 
 class PartEnded(Message):

@@ -30,6 +30,7 @@ from ...checkpoint.protocol import (
     Outcome,
     Performed,
     Released,
+    Retried,
     Snapshot,
     TurnEnd,
 )
@@ -451,7 +452,7 @@ class Proceed(Brick):
                     raise self._raised("heard", no) from no
             self._standing.server.inward(record)
 
-    def tell_outward(self, record: Released | Performed | GivenUp) -> None:
+    def tell_outward(self, record: Released | Performed | Retried | GivenUp) -> None:
         """Tell a message that the protected actor has let out, if this replica leads and is not fenced."""
         standing = self._standing
         if standing.leads and not standing.is_fenced:

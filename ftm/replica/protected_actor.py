@@ -43,6 +43,7 @@ from ...checkpoint.protocol import (
     PipeDone,
     Released,
     Restore,
+    Retried,
     Snapshot,
     SnapshotNow,
     ToHome,
@@ -113,7 +114,7 @@ class Driver(Protocol):
         """See to it that what waits to go home is taken."""
         ...
 
-    def tell_outward(self, record: Released | Performed | GivenUp) -> None:
+    def tell_outward(self, record: Released | Performed | Retried | GivenUp) -> None:
         """Something leaves in the middle of a turn."""
         ...
 
@@ -204,8 +205,8 @@ class Server(lifecycle.HerePlace):
     def _life_ended(self, life: ServerLife, reason: ExitReason) -> None:
         self.life = None
         self._note_work(life)
-        is_failure = self.state.is_stopping or self.attempts.failed is not None
-        if not is_failure and reason.is_clean and life.stage.ignored_why is None:
+        is_failure, has_said = self.state.is_stopping or self.attempts.failed is not None, life.stage.ending is not None
+        if not is_failure and (reason.is_clean or has_said) and life.stage.ignored_why is None:
             self.state.is_over = True
             self.tell_more(Closed(0, pack_exit(reason), False))
         is_missed = not (is_failure or self._rest.is_awaited or self.state.is_over)
@@ -1042,7 +1043,7 @@ class Server(lifecycle.HerePlace):
                     if record.status == FAILED:
                         self.attempts.failed = record.id
                 self.part.ends.append(record)
-            case Released() | Performed() | GivenUp():
+            case Released() | Performed() | Retried() | GivenUp():
                 if self._driver is not None:
                     self._driver.tell_outward(record)
             case Live():

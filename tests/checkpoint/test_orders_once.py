@@ -6,6 +6,7 @@ import asyncio
 import os
 import subprocess
 import sys
+from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
@@ -70,6 +71,12 @@ class Boss(hf.Actor):
                     await self.ctx.flush()
                 case "look":
                     await victim.ask(Life(), IN_TIME)
+                case "link":
+                    self.ctx.link(victim)
+                case "wait":
+                    await self.ctx.sleep(0.3)
+                case "crash":
+                    self.ctx.stop(hf.Crash("Tired", "of it"))
                 case _:
                     raise RuntimeError("boom")
         return self.given
@@ -191,6 +198,35 @@ async def test_behind_a_mechanism_it_is_given_once_per_request(stack: str) -> No
             await is_in_life(other, number + 1)
 
 
+LOSSES = (hf.events.TrustBreached, hf.events.ReplicaLost, hf.events.FailedOver, hf.events.MessageQuarantined)
+
+
+@pytest.mark.parametrize("mechanism", [hf.ftm.LFR(), hf.ftm.TR()], ids=lambda one: one.name)
+async def test_behind_a_mechanism_a_turn_ends_its_actor_once(mechanism: hf.ftm.Mechanism) -> None:
+    """Whoever computes the turn does not die of it: its end is carried out once, at home."""
+    async with hf.ActorSystem("app", log=False, intensity=1000) as system:
+        await victim_at(system)
+        options: dict[str, Any] = {"recovery": method("hybrid"), "bindings": {"victim": "/app/victim"}}
+        boss = await system.start(hf.child("boss", hf.start(Boss), mechanism=mechanism, **options))
+        for number, end in enumerate(("kill", "stop", "crash", "link"), 1):
+            steps, whom = (["link", "kill"], "") if end == "link" else ([end], boss.path)
+            with system.events() as stream:
+                assert await boss.ask(Give(steps, whom), IN_TIME) == number
+                told = [one async for one in until_recovered(stream)]
+                assert await boss.ask(Given(), IN_TIME) == number
+                told += stream.take()
+            kinds = [type(one) for one in told if isinstance(one, (*LOSSES, hf.events.Recovered))]
+            assert kinds == [hf.events.Recovered], end
+
+
+async def until_recovered(stream: hf.events.EventStream) -> AsyncIterator[hf.events.Event]:
+    async with asyncio.timeout(IN_TIME):
+        async for one in stream:
+            yield one
+            if isinstance(one, hf.events.Recovered):
+                return
+
+
 @pytest.mark.parametrize("end", ["killed", "stopped"])
 @pytest.mark.parametrize("name", ["hybrid", "replay_only"])
 async def test_the_next_program_does_not_give_it_again(tmp_path: Path, name: str, end: str, isolation: str) -> None:
@@ -229,6 +265,21 @@ async def test_its_own_stop_is_an_end_by_itself(isolation: str) -> None:
         boss = await start(system, isolation, "boss", hf.start(Boss), **options)
         assert await boss.ask(Give(["stop"], boss.path), IN_TIME) == 1
         await until(lambda: boss._cell.is_dead or not boss._cell.host.is_up(boss._cell))
+
+
+async def test_its_own_stop_behind_a_crash_is_carried_out_once(isolation: str) -> None:
+    async with hf.ActorSystem("app", log=False, intensity=1000) as system:
+        await victim_at(system)
+        boss = await boss_of(system, isolation)
+        asked = boss.ask(Give(["wait", "stop"], boss.path), IN_TIME)
+        await until(lambda: bool(boss._cell.host.rests(boss._cell)))
+        with system.events() as stream:
+            strike(system, boss)
+            assert await asked == 1
+            await event(stream, hf.events.Recovered)
+            await event(stream, hf.events.Recovered)
+            assert await boss.ask(Give([]), IN_TIME) == 2
+            assert not [one for one in stream.take() if isinstance(one, hf.events.Recovered)]
 
 
 async def test_one_that_has_moved_is_found_at_its_new_address() -> None:

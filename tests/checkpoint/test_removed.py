@@ -30,10 +30,39 @@ ORDERS = "tests/checkpoint/test_restart_orders.py"
 RUNTIME = "tests/checkpoint/test_asks_of_the_runtime.py"
 TO_THE_GONE = "tests/checkpoint/test_ties_to_the_gone.py"
 ONCE = "tests/checkpoint/test_orders_once.py"
+ATTEMPTS = "tests/effects/test_failed_attempts.py"
 GIVEN_UP = "tests/checkpoint/test_given_up.py"
 WITHDRAWN = "tests/checkpoint/test_withdrawn.py"
 
 CHECKS = {
+    "what a home knows of a turn is known of one behind a mechanism, too": Check(
+        "system/controls.py",
+        "there, names = known_at_home(told, cell), (",
+        "there, names = told, (",
+        ATTEMPTS,
+        "test_whoever_looks and pbr",
+    ),
+    "a process that speaks for an actor lets out its turn's orders to itself": Check(
+        "checkpoint/home/life_ports.py",
+        "elif out.verb in ORDERS and not gate.speaks_for(out.to):\n",
+        "elif out.verb in ORDERS:\n",
+        ONCE,
+        "ends_its_actor_once and tr",
+    ),
+    "an end that a turn has said is one, whatever its reason": Check(
+        "ftm/replica/protected_actor.py",
+        "(reason.is_clean or has_said)",
+        "reason.is_clean",
+        ONCE,
+        "ends_its_actor_once and tr",
+    ),
+    "a life at the root below a process ends for the reason that its process has ended for": Check(
+        "checkpoint/places/far_parent.py",
+        "noticed=noticed, reason=reason, recovers=recovers\n",
+        "noticed=noticed, recovers=recovers\n",
+        ONCE,
+        "stop_behind_a_crash and subtree",
+    ),
     "an image that its life has given up is no failure": Check(
         "checkpoint/snapshot/snapshot_blocks.py",
         "            if self._is_missed:\n",

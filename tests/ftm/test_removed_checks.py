@@ -20,6 +20,13 @@ FAILOVER, CHECKS_ALONE = "tests/ftm/test_failover.py", "tests/ftm/test_checks.py
 AUTHORS = "tests/ftm/test_author_bricks.py"
 REVOKED, LINKS = "tests/ftm/test_revoked_replicas.py", "tests/ftm/sec/test_link.py"
 CHECKS = {
+    "a process speaks for the actor whose replica it is, and for no other": Check(
+        "actors/process/wire/worker_gate.py",
+        "        return self._node.cell_at(path).living.path in self._voices()\n",
+        "        return True\n",
+        HOSTILE,
+        "test_the_order_of_a_leader and kill and pbr",
+    ),
     "what a leader lets out is looked at as what any process lets out": Check(
         "ftm/group/proxy.py",
         "        if not self._may_leave(message):\n",

@@ -172,6 +172,10 @@ class WorkerGate:
         if path not in self._voices():
             self.require_own(path, what)
 
+    def speaks_for(self, path: str) -> bool:
+        """Whether an address is the one whose replica it is, whatever its name was: a turn may end its own actor."""
+        return self._node.cell_at(path).living.path in self._voices()
+
     def require_granted(self, path: str, what: str) -> None:
         """An address to which it may give orders."""
         cell = self._worker.cell

@@ -10,6 +10,7 @@ from typing import TypeAlias
 from ....actors.events import (
     DeadLetter,
     EffectRepeated,
+    EffectRetried,
     Event,
     LoopLagged,
     SnapshotFailed,
@@ -40,6 +41,7 @@ TOLD_APART_BY: Mapping[type[Event], tuple[str, ...]] = MappingProxyType(
         DeadLetter: ("message", "why"),
         Diverged: ("replica", "name"),
         EffectRepeated: ("message",),
+        EffectRetried: ("effect",),
         FrameRefused: ("place", "reason"),
         LoopLagged: (),
         Masked: ("replica",),
