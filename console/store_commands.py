@@ -39,7 +39,10 @@ DAMAGED = 1
 UNREADABLE = 2
 
 store = typer.Typer(
-    name="store", help="Look after a store: verify it, copy it, bring a copy back.", no_args_is_help=True
+    name="store",
+    help="Look after a store: verify it, copy it, bring a copy back.",
+    no_args_is_help=True,
+    add_completion=False,
 )
 
 

@@ -185,7 +185,7 @@ def run(folder: Path, what: str, **more: str) -> subprocess.CompletedProcess[str
 
 @pytest.mark.parametrize(
     ("end", "changes"),
-    [("killed", "code template state isolation move protect bind unfit"), ("stopped", "code template state unfit")],
+    [("killed", "code template state isolation move protect bind unfit"), ("stopped", "code template")],
 )
 def test_start_check_and_replay_agree(tmp_path: Path, end: str, changes: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Turns before a class or a state was put in place are no matter of what follows: nobody handles them again."""
