@@ -11,7 +11,7 @@ from typer.core import TyperGroup
 from .operate import reaching
 
 PLACES: Final = {
-    "demo": "demo_command:demo",
+    "demo": "service.demo_command:demo",
     "ls": "operate.looking:ls",
     "tree": "operate.looking:tree",
     "top": "operate.looking:top",

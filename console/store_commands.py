@@ -33,7 +33,7 @@ from ..cluster.configuration import read_configuration
 from ..cluster.joining import is_same_store, open_store, other_systems
 from ..system.stored_erasure import erase_stored
 from .operate.reaching import Yes, confirm
-from .store_options import KeyFile, StorePath, file_path
+from .service.store_options import KeyFile, StorePath, file_path
 
 DAMAGED = 1
 UNREADABLE = 2

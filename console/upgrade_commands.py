@@ -14,7 +14,7 @@ import typer
 from ..actors.errors import HoldfastError
 from ..system.upgrade import AddressCheck, ReplayedState, ReplayedTurn, UpgradeCheck, check_upgrade, replay_actor
 from ..system.upgrade.checked_upgrade import TURN_TIMEOUT
-from .store_options import KeyFile, StorePath
+from .service.store_options import KeyFile, StorePath
 
 DIFFERS: Final = 1
 UNCHECKED: Final = 2

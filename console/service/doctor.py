@@ -21,7 +21,7 @@ import typer
 from ...actors.errors import HoldfastError
 from ..operate.reaching import FAILED, Json, show_json
 from ..runtime_folder import found_sockets, runtime_folder
-from ..store_options import KeyFile
+from .store_options import KeyFile
 
 Verdict = Literal["ok", "warning", "failed"]
 LEAST_FILES: Final = 4096

@@ -27,10 +27,10 @@ from ..declare.tree_plan import actor_places, change_to, declare, other_code
 from ..declare.wanted_tree import WantedSpecs
 from ..endpoint import served
 from ..operate.reaching import FAILED, UNUSABLE, ended
-from ..store_options import KeyFile
 from .health import Service
 from .notify import Notifier
 from .reloading import ProjectModules
+from .store_options import KeyFile
 
 RELOAD_TIMEOUT = 60.0
 """Seconds that a reload may take."""

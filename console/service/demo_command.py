@@ -7,7 +7,7 @@ from typing import Annotated, Final
 
 import typer
 
-from .. import HoldfastError, run
+from ... import HoldfastError, run
 
 DIFFERS: Final = 1
 
@@ -30,7 +30,7 @@ def demo(
     """
     from rich.console import Console
 
-    from .bank_demo import show_bank
+    from ..bank_demo import show_bank
 
     try:
         report = run(show_bank(Console(), seconds=seconds, method=method.value, seed=seed))
