@@ -70,13 +70,14 @@ class Stranger(One): ...
 
 
 RECORDS = hf.hybrid(interval=1000.0)
-CHANGES = ("code", "template", "state", "isolation", "move", "protect", "bind", "unfit")
+CHANGES = ("code", "template", "state", "unfit", "isolation", "move", "protect", "bind")
 MOMENTS = [("waits", "none"), ("waits", "before"), ("waits", "within"), ("rests", "before"), ("rests", "after")]
 ROWS = [
     (change, *moment)
     for change in os.environ.get("CHANGES", " ".join(CHANGES)).split()
     for moment in MOMENTS
     if change != "move" or moment[0] == "rests"  # A turn that waits keeps its actor where it is.
+    if change in CHANGES[:4] or moment[1] == "before" or "HOLDFAST_CROSSED" in os.environ
 ]
 
 
