@@ -50,6 +50,25 @@ def class_of(cell: Cell) -> type[Actor] | None:
     return None if start is None else start.kind
 
 
+def other_class(recorded: str, kind: type[Actor] | None) -> str:
+    """Why a class does not go on with what another one has recorded, in words; "" if it does.
+
+    Args:
+        recorded: the name of the class that has recorded it; "" if nobody has said.
+        kind: the class that is to go on; None if it is not loaded here.
+    """
+    if kind is None or not recorded:
+        return ""
+    name = message_name(kind)
+    if name == recorded or recorded in former_names(kind):
+        return ""
+    return (
+        f"it was recorded by {recorded}, and is to be started as {name}; start it as {recorded}, "
+        f"or with fresh=True, which forgets it; or, if {name} is to handle its messages and go on with its state, "
+        f"say @hf.renamed({recorded!r}) above that class"
+    )
+
+
 class Shapes:
     """What one home knows of the code that has written its records.
 
@@ -178,7 +197,7 @@ class Shapes:
         Raises:
             StartFailed: it says which one it was. Nothing was changed.
         """
-        problem = self._other_class(class_of(cell))
+        problem = other_class(self.kind, class_of(cell))
         if problem:
             raise StartFailed(cell.path, f"{UNFIT}: {problem}")
 
@@ -186,18 +205,6 @@ class Shapes:
         """All has been read; returns what was written otherwise than it would be now."""
         old, self.old = self.old, OldRecords(self._home.node.codec, self._class)
         return old
-
-    def _other_class(self, kind: type[Actor] | None) -> str:
-        if kind is None or not self.kind:
-            return ""
-        name = message_name(kind)
-        if name == self.kind or self.kind in former_names(kind):
-            return ""
-        return (
-            f"it was recorded by {self.kind}, and is to be started as {name}; start it as {self.kind}, "
-            f"or with fresh=True, which forgets it; or, if {name} is to handle its messages and go on with its state, "
-            f"say @hf.renamed({self.kind!r}) above that class"
-        )
 
     # ---- comparing
 

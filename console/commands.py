@@ -2,53 +2,97 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
-from importlib.metadata import PackageNotFoundError, version
-from typing import Annotated
+from importlib import import_module
+from typing import Annotated, Any, Final
 
 import typer
-from rich.console import Console
+from typer.core import TyperGroup
 
-from .. import HoldfastError, run
-from . import mechanism_commands, upgrade_commands
-from .nats_commands import nats
-from .operate import (
-    changing,
-    connecting,
-    declaring,
-    diagnosing,
-    following,
-    looking,
-    reaching,
-    remembering,
-    repairing,
-    retrying,
-    showing,
-    speaking,
-)
-from .service import doctor, project, service_run
-from .store_commands import store
+from .operate import reaching
+
+PLACES: Final = {
+    "demo": "service.demo_command:demo",
+    "ls": "operate.looking:ls",
+    "tree": "operate.looking:tree",
+    "top": "operate.looking:top",
+    "inspect": "operate.looking:inspect",
+    "trace": "operate.following:trace",
+    "logs": "operate.following:logs",
+    "ask": "operate.speaking:ask",
+    "tell": "operate.speaking:tell",
+    "suspend": "operate.changing:suspend",
+    "resume": "operate.changing:resume",
+    "restart": "operate.changing:restart",
+    "stop": "operate.changing:stop",
+    "start": "operate.changing:start",
+    "remove": "operate.changing:remove",
+    "bind": "operate.changing:bind",
+    "unbind": "operate.changing:unbind",
+    "protect": "operate.changing:protect",
+    "checkpoint": "operate.changing:checkpoint",
+    "why": "operate.remembering:why",
+    "history": "operate.remembering:history",
+    "events": "operate.remembering:events",
+    "dead-letters": "operate.remembering:dead_letters",
+    "diagnose": "operate.diagnosing:diagnose",
+    "plan": "operate.declaring:plan",
+    "apply": "operate.declaring:apply",
+    "dashboard": "operate.showing:dashboard",
+    "run": "service.service_run:run",
+    "new": "service.project:new",
+    "doctor": "service.doctor:doctor",
+    "check-upgrade": "upgrade_commands:check",
+    "replay": "upgrade_commands:replay",
+    "coverage": "mechanism_commands:show_coverage",
+    "select": "mechanism_commands:show_selection",
+    "quarantine": "operate.retrying:quarantine",
+    "connections": "operate.connecting:connections",
+    "repair": "operate.repairing:repair",
+    "store": "store_commands:store",
+    "nats": "nats_commands:nats",
+}
+"""The module of each command, and the function or the group there that it is."""
+
+
+class OneByOne(TyperGroup):
+    """A group whose commands are imported when they are asked for: none waits for what the others need."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """All names, in the order of the help."""
+        return list(PLACES)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """One command; for a name that is none all of them, from which the nearest one is suggested."""
+        for name in [cmd_name] if cmd_name in PLACES else PLACES:
+            if name not in self.commands:
+                self.commands[name] = _imported(name)
+        return self.commands.get(cmd_name)
+
+
+def _imported(name: str) -> Any:
+    module, _, part = PLACES[name].partition(":")
+    found: Any = vars(import_module(f".{module}", __package__))[part]
+    if isinstance(found, typer.Typer):
+        return typer.main.get_command(found)
+    alone = typer.Typer(add_completion=False)
+    alone.command(name)(found)
+    return typer.main.get_command(alone)
+
 
 commands = typer.Typer(
     name="holdfast",
+    cls=OneByOne,
     help="Actors in supervision trees, with crash recovery that loses nothing.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
 
-DIFFERS = 1
-
-
-class RecoveryChoice(StrEnum):
-    """How a killed account comes back."""
-
-    HYBRID = "hybrid"
-    FRESH = "fresh"
-
 
 def _print_version(wanted: bool) -> None:
     if not wanted:
         return
+    from importlib.metadata import PackageNotFoundError, version  # only now: it takes longer than many commands need
+
     try:
         typer.echo(f"holdfast {version('holdfast')}")
     except PackageNotFoundError:  # Run from a checkout that is not installed.
@@ -73,67 +117,3 @@ def holdfast(
 ) -> None:
     """Actors in supervision trees, with crash recovery that loses nothing."""
     reaching.NODE.set(node)
-
-
-@commands.command()
-def demo(
-    seconds: Annotated[float, typer.Option(min=0.1, max=3600.0, help="How long processes are killed.")] = 4.0,
-    method: Annotated[RecoveryChoice, typer.Option(help="How a killed account comes back.")] = RecoveryChoice.HYBRID,
-    seed: Annotated[int, typer.Option(help="Draws which process is killed, and when.")] = 7,
-) -> None:
-    """Run a bank whose accounts are killed with SIGKILL again and again while their customers pay in.
-
-    Exit status 0: every payment was answered and booked once. 1: a payment was lost or doubled.
-    """
-    from .bank_demo import show_bank
-
-    try:
-        report = run(show_bank(Console(), seconds=seconds, method=method.value, seed=seed))
-    except HoldfastError as error:
-        typer.echo(f"holdfast demo: {error}", err=True)
-        raise typer.Exit(DIFFERS) from error
-    if not report.is_good:
-        raise typer.Exit(DIFFERS)
-
-
-for command in (
-    looking.ls,
-    looking.tree,
-    looking.top,
-    looking.inspect,
-    following.trace,
-    following.logs,
-    speaking.ask,
-    speaking.tell,
-    changing.suspend,
-    changing.resume,
-    changing.restart,
-    changing.stop,
-    changing.start,
-    changing.remove,
-    changing.bind,
-    changing.unbind,
-    changing.protect,
-    changing.checkpoint,
-    remembering.why,
-    remembering.history,
-    remembering.events,
-    remembering.dead_letters,
-    diagnosing.diagnose,
-    declaring.plan,
-    declaring.apply,
-    showing.dashboard,
-    service_run.run,
-    project.new,
-    doctor.doctor,
-):
-    commands.command()(command)
-commands.command("check-upgrade")(upgrade_commands.check)
-commands.command("replay")(upgrade_commands.replay)
-commands.command("coverage")(mechanism_commands.show_coverage)
-commands.command("select")(mechanism_commands.show_selection)
-commands.add_typer(retrying.quarantine)
-commands.add_typer(connecting.connections)
-commands.add_typer(repairing.repair)
-commands.add_typer(store)
-commands.add_typer(nats)

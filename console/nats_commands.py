@@ -16,7 +16,10 @@ from ..cluster.nats.server_file import ServerPlan, TlsFiles, write_server_files
 from .operate.reaching import FAILED, UNUSABLE, Json, printable, show_json
 
 nats = typer.Typer(
-    name="nats", help="Set up NATS servers for systems on several machines, and check them.", no_args_is_help=True
+    name="nats",
+    help="Set up NATS servers for systems on several machines, and check them.",
+    no_args_is_help=True,
+    add_completion=False,
 )
 
 

@@ -10,7 +10,6 @@ from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import msgspec
-import psutil
 
 from ..actors.control.orders import Status, status_of
 from ..actors.errors import HoldfastError, NoSuchActor, type_name
@@ -290,6 +289,8 @@ def as_told(row: ActorRow, status: Status | None) -> ActorRow:
 
 def process_use(pid: int) -> ProcessUse | None:
     """What a process has used so far; None if it has ended."""
+    import psutil  # only in the program that is looked at: the commands do without it
+
     try:
         process = psutil.Process(pid)
         with process.oneshot():

@@ -33,40 +33,19 @@ from ..cluster.configuration import read_configuration
 from ..cluster.joining import is_same_store, open_store, other_systems
 from ..system.stored_erasure import erase_stored
 from .operate.reaching import Yes, confirm
+from .service.store_options import KeyFile, StorePath, file_path
 
 DAMAGED = 1
 UNREADABLE = 2
 
 store = typer.Typer(
-    name="store", help="Look after a store: verify it, copy it, bring a copy back.", no_args_is_help=True
+    name="store",
+    help="Look after a store: verify it, copy it, bring a copy back.",
+    no_args_is_help=True,
+    add_completion=False,
 )
 
 
-def _file(path: Path) -> Path:
-    """A path, if it is not the address of servers.
-
-    Raises:
-        BadParameter: it is one.
-    """
-    if path.parts[:1] in (("nats:",), ("tls:",)):
-        problem = (
-            "this is for a store in a file: copy the one on servers into a file (holdfast store copy), and take that"
-        )
-        raise typer.BadParameter(problem)
-    return path
-
-
-StorePath = Annotated[
-    Path, typer.Argument(help="The database of a store: app.db, as in store='sqlite:app.db'.", callback=_file)
-]
-KeyFile = Annotated[
-    Path | None,
-    typer.Option(
-        "--key-file",
-        envvar="HOLDFAST_STORE_KEY_FILE",
-        help="Of an encrypted store: the file with its key, which only its owner may read.",
-    ),
-]
 NewKeyFile = Annotated[Path | None, typer.Option("--new-key-file", help="The file with the key of the copy.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 
@@ -253,7 +232,9 @@ def _erased(found: Erased) -> str:
 @store.command()
 def backup(
     path: StorePath,
-    dest: Annotated[Path, typer.Argument(help="The database of the copy, which must not be there.", callback=_file)],
+    dest: Annotated[
+        Path, typer.Argument(help="The database of the copy, which must not be there.", callback=file_path)
+    ],
     check: Annotated[bool, typer.Option("--verify/--no-verify", help="Verify the copy when it is made.")] = True,
     key_file: KeyFile = None,
     as_json: Json = False,
@@ -271,9 +252,10 @@ def backup(
 @store.command()
 def restore(
     path: Annotated[
-        Path, typer.Argument(metavar="BACKUP", help="The database of the backup; it stays as it is.", callback=_file)
+        Path,
+        typer.Argument(metavar="BACKUP", help="The database of the backup; it stays as it is.", callback=file_path),
     ],
-    dest: Annotated[Path, typer.Argument(help="The database to be made, which must not be there.", callback=_file)],
+    dest: Annotated[Path, typer.Argument(help="The database to be made, which must not be there.", callback=file_path)],
     key_file: KeyFile = None,
     as_json: Json = False,
 ) -> None:

@@ -14,13 +14,13 @@ import typer
 from ..actors.errors import HoldfastError
 from ..system.upgrade import AddressCheck, ReplayedState, ReplayedTurn, UpgradeCheck, check_upgrade, replay_actor
 from ..system.upgrade.checked_upgrade import TURN_TIMEOUT
+from .service.store_options import KeyFile, StorePath
 
 DIFFERS: Final = 1
 UNCHECKED: Final = 2
 MOST_TEXT, MOST_TEXT_AS_JSON, MOST_ITEMS = 200, 10_000, 100
 """Characters of a text, and items of a list, that are shown; what is longer is cut."""
 
-StorePath = Annotated[Path, typer.Argument(metavar="STORE", help="The database of the store, which is not changed.")]
 Recovery = Annotated[Path | None, typer.Option(metavar="FILE", help="The recovery file of the program.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 
@@ -31,6 +31,7 @@ def check(
         str, typer.Argument(metavar="MODULE:SPEC", help="What the new program starts: shop.main:tree, or app.py:tree.")
     ],
     recovery: Recovery = None,
+    key_file: KeyFile = None,
     turn_timeout: Annotated[float, typer.Option(min=0.1, help="Seconds that a turn may take.")] = TURN_TIMEOUT,
     as_json: Json = False,
 ) -> None:
@@ -40,7 +41,10 @@ def check(
 
     Exit status 0: all is fine. 1: something differs. 2: something cannot be checked.
     """
-    found = _had("check-upgrade", lambda: check_upgrade(store, spec, recovery=recovery, turn_timeout=turn_timeout))
+    found = _had(
+        "check-upgrade",
+        lambda: check_upgrade(store, spec, recovery=recovery, store_key=key_file, turn_timeout=turn_timeout),
+    )
     if as_json:
         typer.echo(json.dumps({"is_fine": found.is_fine, **dataclasses.asdict(found)}))
     else:
@@ -80,6 +84,7 @@ def replay(
         str | None, typer.Option(metavar="MODULE:SPEC", help="What the program starts; else the recorded class alone.")
     ] = None,
     recovery: Recovery = None,
+    key_file: KeyFile = None,
     breaks: Annotated[bool, typer.Option("--break", help="Stop in pdb before the handler of the last turn.")] = False,
     as_json: Json = False,
 ) -> None:
@@ -99,6 +104,7 @@ def replay(
             since=since,
             target=spec,
             recovery=recovery,
+            store_key=key_file,
             breaks=breaks,
             told=turns.append if as_json else _show_turn,
         ),

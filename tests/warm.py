@@ -280,6 +280,8 @@ def warm_up(control: socket.socket) -> None:
     boot.adopt_package(begin["package"], begin["package_path"])
     for name in MODULES:
         importlib.import_module(name)
+    for place in sys.modules["holdfast.console.commands"].PLACES.values():
+        importlib.import_module(f"holdfast.console.{place.partition(':')[0]}")
     import gc
 
     gc.collect()

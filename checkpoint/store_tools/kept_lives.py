@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import msgspec
 
@@ -12,7 +12,10 @@ from ...actors.kernel.node import Node, Ports
 from ...actors.state_hooks import migrated, renames_in
 from ...actors.values import decode_value, state_digest
 from ..home.homes import Homes
+from ..inputs import spread
 from ..journal import Saved
+from ..protocol import START
+from ..schema import other_class
 from ..snapshot.key_variables import save_state
 from ..snapshot.shared_blocks import by_segment
 from ..snapshot.snapshot_record import Meta, decode_meta, encode_meta
@@ -28,6 +31,44 @@ class KeptLife(NamedTuple):
 
     saved: Saved
     meta: Meta | None
+
+    @property
+    def turn(self) -> int:
+        """The last turn that its state contains; -1 if it begins at the very start."""
+        return -1 if self.meta is None else self.meta.turn
+
+    @property
+    def kind(self) -> str:
+        """The name of the class that has lived it; "" if nothing says so."""
+        if self.meta is not None and self.meta.made.kind:
+            return self.meta.made.kind
+        entries = (one for _, entry in self.saved.entries for one in spread(entry))
+        return next((cast("bytes", one[4]).decode() for one in entries if one[0] == "in" and one[2] == START), "")
+
+
+def lives_of(lives: list[KeptLife], kind: type[Actor]) -> tuple[list[KeptLife], str]:
+    """Those that a class goes on with, and what is to be said of earlier ones, which another class has lived.
+
+    A program begins with the latest life, and that one is always among them, so that what starts it judges whether the
+    class fits it.
+    """
+    first = len(lives) - 1
+    while first and not other_class(lives[first - 1].kind, kind):
+        first -= 1
+    if not first:
+        return lives, ""
+    was = lives[first - 1].kind
+    return lives[first:], f"turns up to {lives[first].turn} were handled by {was}, which was replaced behind them"
+
+
+def lives_to(lives: list[KeptLife], until: int | None) -> list[KeptLife]:
+    """Those from which turns up to `until` (None: all of them) lead to the state that was there then.
+
+    Turns before a state or a class was put in place from outside do not lead to what follows.
+    """
+    some = [one for one in lives if until is None or one.turn < until] or lives[:1]
+    replaced = [number for number, one in enumerate(some) if one.meta is not None and one.meta.is_replaced]
+    return some[max(replaced, default=0) :]
 
 
 def kept_lives(homes: Homes, path: str) -> list[KeptLife]:

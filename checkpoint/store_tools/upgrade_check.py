@@ -19,7 +19,7 @@ from ..inputs import spread
 from ..journal import Entry
 from ..protocol import Feed
 from ..snapshot.snapshot_record import Meta
-from .kept_lives import KeptLife, kept_lives, state_differences
+from .kept_lives import KeptLife, kept_lives, lives_of, state_differences
 from .rerun import LifeEnded, NotRecorded, Recipe, Rerun
 
 Verdict = Literal["fine", "ended", "differs", "refused", "missing", "unchecked"]
@@ -72,6 +72,7 @@ async def check_address(
         lives = kept_lives(homes, path)
     except HoldfastError as error:
         return AddressCheck(path, "unchecked", problem=str(error))
+    lives, replaced = lives_of(lives, recipe.start.kind)
     if not recipe.method.replays:
         lives = lives[-1:]
     check = _Checking(homes, path, recipe, on_turn)
@@ -80,7 +81,7 @@ async def check_address(
         found = await check.from_snapshot(life, following)
         if found is not None:
             return found
-    return AddressCheck(path, "fine", check.turns, note=check.note)
+    return AddressCheck(path, "fine", check.turns, note="; ".join(filter(None, (replaced, check.note))))
 
 
 def _has_digest(entry: Entry) -> bool:

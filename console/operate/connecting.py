@@ -15,6 +15,7 @@ connections = typer.Typer(
     name="connections",
     help="List the programs that are connected, or drop what is kept for a system that does not come back.",
     invoke_without_command=True,
+    add_completion=False,
 )
 
 

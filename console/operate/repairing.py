@@ -18,6 +18,7 @@ repair = typer.Typer(
     name="repair",
     help="See how repair stands, approve or deny its plans, and say how far it may go.",
     no_args_is_help=True,
+    add_completion=False,
 )
 
 Case = Annotated[int, typer.Argument(min=1, help="The number of the case, as `holdfast diagnose` tells it.")]

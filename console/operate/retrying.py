@@ -49,6 +49,7 @@ quarantine = typer.Typer(
     name="quarantine",
     cls=ListByDefault,
     help="List, retry or drop the messages that were put aside because they have ended their actor's process.",
+    add_completion=False,
 )
 
 Address = Annotated[str, typer.Argument(metavar="PATH", help="An address.", autocompletion=complete_path)]

@@ -21,6 +21,7 @@ import typer
 from ...actors.errors import HoldfastError
 from ..operate.reaching import FAILED, Json, show_json
 from ..runtime_folder import found_sockets, runtime_folder
+from .store_options import KeyFile
 
 Verdict = Literal["ok", "warning", "failed"]
 LEAST_FILES: Final = 4096
@@ -146,7 +147,7 @@ def folder() -> Iterator[MachineFinding]:
         yield fail("runtime folder", str(error), "systems are not found by name; set XDG_RUNTIME_DIR, or use --socket")
 
 
-def store(path: Path) -> Iterator[MachineFinding]:
+def store(path: Path, key_file: Path | None = None) -> Iterator[MachineFinding]:
     """A store: where it is, what room it has, and whether all of it is good."""
     about = f"store {path}"
     if not path.exists():
@@ -166,7 +167,7 @@ def store(path: Path) -> Iterator[MachineFinding]:
     from ...checkpoint.store_tools import verify_store  # only now: sqlite3 takes a while to import
 
     try:
-        found = verify_store(path)
+        found = verify_store(path, key=key_file)
     except HoldfastError as error:
         yield fail(about, str(error), "holdfast store verify says more")
         return
@@ -191,6 +192,7 @@ def doctor(
     stores: Annotated[
         list[Path] | None, typer.Argument(metavar="[STORE]...", help="Databases of stores to look at, too.")
     ] = None,
+    key_file: KeyFile = None,
     as_json: Json = False,
 ) -> None:
     """Look at the machine: Python, limits, memory, clock, the runtime folder, and the stores that are named.
@@ -198,7 +200,7 @@ def doctor(
     Exit status 0: nothing has failed; there may be warnings. 1: something has.
     """
     found = [one for look in LOOKS for one in look()]
-    found += [one for path in stores or () for one in store(path)]
+    found += [one for path in stores or () for one in store(path, key_file)]
     if as_json:
         show_json([dataclasses.asdict(one) for one in found])
     else:

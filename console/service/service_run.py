@@ -30,6 +30,7 @@ from ..operate.reaching import FAILED, UNUSABLE, ended
 from .health import Service
 from .notify import Notifier
 from .reloading import ProjectModules
+from .store_options import KeyFile
 
 RELOAD_TIMEOUT = 60.0
 """Seconds that a reload may take."""
@@ -204,12 +205,7 @@ def run(
     store: Annotated[str | None, typer.Option(help="Where states are kept: sqlite:app.db.")] = None,
     durability: Annotated[str | None, typer.Option(help="memory, os or fsync.")] = None,
     recovery: Annotated[Path | None, typer.Option(metavar="FILE", help="A recovery file.")] = None,
-    key_file: Annotated[
-        Path | None,
-        typer.Option(
-            "--key-file", envvar="HOLDFAST_STORE_KEY_FILE", help="Of an encrypted store: the file with its key."
-        ),
-    ] = None,
+    key_file: KeyFile = None,
     takeover: Annotated[bool, typer.Option("--takeover", help="Kill the process that has the store open.")] = False,
     probes: Annotated[
         str | None, typer.Option(metavar="HOST:PORT", help="Where /livez and /readyz are answered over HTTP.")

@@ -24,6 +24,7 @@ from ...actors.errors import HoldfastError, SpecError
 from ...actors.exit_reasons import Signal
 from ...actors.process.fork.launch import import_path
 from ...actors.seconds import check_seconds
+from ...checkpoint.store_key import StoreKey, read_store_key
 from ...checkpoint.store_tools.copies import back_up_store
 from ...checkpoint.store_tools.upgrade_check import DIFFERENT, AddressCheck
 from .page import PAGE_BYTES, WorkerPosition, read_place
@@ -75,6 +76,7 @@ def check_upgrade(
     target: str,
     *,
     recovery: str | os.PathLike[str] | None = None,
+    store_key: StoreKey | None = None,
     turn_timeout: float = TURN_TIMEOUT,
 ) -> UpgradeCheck:
     """Check whether a new program goes on with what a store has recorded as the old one would; it is not changed.
@@ -88,32 +90,36 @@ def check_upgrade(
         target: the specs of the new program, as "module:name" or "program.py:name" (see `load_specs`). Nothing of it
             is imported in this process.
         recovery: the recovery file of the new program, if it has one.
+        store_key: of an encrypted store, as in `ActorSystem(store_key=...)`; the copy is encrypted with it, too.
         turn_timeout: seconds a turn may take; one that takes longer is a difference.
 
     Raises:
-        SpecError: the specs cannot be had. StoreError: the store cannot be read or copied.
+        SpecError: the specs cannot be had. StoreError: the store cannot be read or copied. WrongStoreKey: the key
+            is not the store's.
     """
     seconds = check_seconds("check_upgrade", "turn_timeout", turn_timeout)
-    where = os.path.realpath(store)
+    where, secret = os.path.realpath(store), read_store_key(store_key)
     with tempfile.TemporaryDirectory(prefix="holdfast-upgrade-") as folder:
         copy = os.path.join(folder, "copy.db")
-        back_up_store(where, copy)
+        back_up_store(where, copy, key=secret)
         order = {
             "store": copy,
             "target": target,
             "recovery": None if recovery is None else os.path.abspath(recovery),
             "page": os.path.join(folder, "page"),
+            "has_key": secret is not None,
         }
-        checks = list(_checks(order, folder, seconds))
+        checks = list(_checks(order, folder, seconds, secret))
     return UpgradeCheck(where, target, checks)
 
 
-def _checks(order: dict[str, Any], folder: str, seconds: float) -> Iterator[AddressCheck]:
+def _checks(order: dict[str, Any], folder: str, seconds: float, secret: bytes | None) -> Iterator[AddressCheck]:
     """All addresses, in processes that follow one another if need be."""
     left: list[str] | None = None
     while left is None or left:
         try:
-            for record in _records(order if left is None else {**order, "addresses": left}, folder, seconds):
+            ordered = order if left is None else {**order, "addresses": left}
+            for record in _records(ordered, folder, seconds, secret):
                 if "error" in record:
                     raise HoldfastError(record["error"])
                 if "addresses" in record:
@@ -135,7 +141,7 @@ def _checks(order: dict[str, Any], folder: str, seconds: float) -> Iterator[Addr
                 yield AddressCheck(address, "differs", place.handled, place.turn, place.message, why)
 
 
-def _records(order: dict[str, Any], folder: str, seconds: float) -> Iterator[dict[str, Any]]:
+def _records(order: dict[str, Any], folder: str, seconds: float, secret: bytes | None) -> Iterator[dict[str, Any]]:
     """What one process says, to its end.
 
     Raises:
@@ -143,7 +149,7 @@ def _records(order: dict[str, Any], folder: str, seconds: float) -> Iterator[dic
     """
     with open(order["page"], "w+b") as file, open(os.path.join(folder, "errors"), "w+b") as errors:
         file.truncate(PAGE_BYTES)
-        with mmap.mmap(file.fileno(), PAGE_BYTES) as page, _running(order, errors) as (process, said):
+        with mmap.mmap(file.fileno(), PAGE_BYTES) as page, _running(order, errors, secret) as (process, said):
             lines = _lines(process, said, page, seconds)
             for line in lines:
                 record = json.loads(line)
@@ -162,7 +168,7 @@ def _lost(status: int, errors: IO[bytes], place: WorkerPosition) -> NoReturn:
 
 @contextlib.contextmanager
 def _running(
-    order: dict[str, Any], errors: IO[bytes]
+    order: dict[str, Any], errors: IO[bytes], secret: bytes | None
 ) -> Generator[tuple[subprocess.Popen[bytes], IO[bytes]], None, None]:
     """A process that checks; it ends with this block at the latest, with all that it has started."""
     read, write = os.pipe()
@@ -170,7 +176,7 @@ def _running(
         try:
             process = subprocess.Popen(
                 [sys.executable, "-c", PROCESS, json.dumps(order), str(write)],
-                stdin=subprocess.PIPE,  # Its end tells the process that this one is gone.
+                stdin=subprocess.PIPE,  # It gives the key, and its end tells the process that this one is gone.
                 stdout=subprocess.DEVNULL,
                 stderr=errors,
                 pass_fds=(write,),
@@ -181,6 +187,9 @@ def _running(
             os.close(write)
         with process:
             try:
+                if secret is not None and process.stdin is not None:
+                    with contextlib.suppress(BrokenPipeError):  # How it has ended is found where its lines are read.
+                        os.write(process.stdin.fileno(), secret)
                 yield process, said
             finally:
                 with contextlib.suppress(ProcessLookupError):

@@ -16,6 +16,7 @@ from typing import Any
 from ...actors.errors import HoldfastError
 from ...actors.kernel.node import Node
 from ...checkpoint.recovery_file import load_recovery
+from ...checkpoint.store_key import KEY_BYTES
 from ...checkpoint.store_opening import open_journal
 from ...checkpoint.store_tools.kept_lives import apart
 from ...checkpoint.store_tools.rerun import Recipe
@@ -31,6 +32,7 @@ def main() -> None:
     os.set_inheritable(said.fileno(), False)
     sys.argv[1:] = []
     gc.set_threshold(50_000)  # What is read back stays: to look through it again and again takes a fifth of the time.
+    key = os.read(0, KEY_BYTES) if order["has_key"] else None
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
     def tell(record: dict[str, Any]) -> None:
@@ -39,7 +41,7 @@ def main() -> None:
 
     try:
         with open(order["page"], "r+b") as file, mmap.mmap(file.fileno(), PAGE_BYTES) as page:
-            asyncio.run(_check(order, Progress(page), tell))
+            asyncio.run(_check(order, key, Progress(page), tell))
     except (HoldfastError, OSError) as error:
         tell({"error": str(error)})
     tell({"over": True})
@@ -52,11 +54,13 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-async def _check(order: dict[str, Any], progress: Progress, tell: Callable[[dict[str, Any]], None]) -> None:
+async def _check(
+    order: dict[str, Any], key: bytes | None, progress: Progress, tell: Callable[[dict[str, Any]], None]
+) -> None:
     """Raises HoldfastError, OSError: nothing can be checked."""
     specs = load_specs(order["target"])
     file = None if order["recovery"] is None else load_recovery(order["recovery"])
-    homes = apart(Node("check", asyncio.get_running_loop()), open_journal(f"sqlite:{order['store']}"))
+    homes = apart(Node("check", asyncio.get_running_loop()), open_journal(f"sqlite:{order['store']}", key=key))
     program = NewProgram(homes, specs, file)
     addresses: list[str] = order.get("addresses") or sorted(homes.known(""))
     tell({"addresses": addresses})

@@ -31,7 +31,6 @@ from ...checkpoint.protocol import (
     NOTHING,
     REPLY,
     SINCE_THEN,
-    START,
     Answer,
     Out,
     untimed,
@@ -39,9 +38,10 @@ from ...checkpoint.protocol import (
 from ...checkpoint.recovery_file import load_recovery
 from ...checkpoint.schema import Shape, shape_of
 from ...checkpoint.snapshot.key_variables import save_state
+from ...checkpoint.store_key import StoreKey, read_store_key
 from ...checkpoint.store_opening import open_journal
 from ...checkpoint.store_tools.copies import back_up_store
-from ...checkpoint.store_tools.kept_lives import KeptLife, apart, kept_lives
+from ...checkpoint.store_tools.kept_lives import KeptLife, apart, kept_lives, lives_to
 from ...checkpoint.store_tools.plain_export import plain_message, plain_result, plain_state
 from ...checkpoint.store_tools.rerun import LifeEnded, Recipe, Rerun
 from ...checkpoint.store_tools.upgrade_check import AddressCheck
@@ -111,6 +111,7 @@ def replay_actor(
     since: int | None = None,
     target: str | None = None,
     recovery: str | os.PathLike[str] | None = None,
+    store_key: StoreKey | None = None,
     breaks: bool = False,
     told: Callable[[ReplayedTurn], None] = lambda turn: None,
 ) -> ReplayedState:
@@ -121,27 +122,31 @@ def replay_actor(
     Args:
         store: the path of the SQLite database.
         address: of the actor.
-        until: the last turn that is lived; all of them if left out, and that in hand as far as it had come.
+        until: the last turn that is lived; all of them if left out, and that in hand as far as it had come. Turns
+            before a state or a class was put in place from outside are lived if this is one of them.
         since: the first turn that is told of; all that are kept if left out.
         target: the specs of the program (see `load_specs`). Left out, the recorded class is started without arguments.
         recovery: the recovery file of the program, if it has one.
+        store_key: of an encrypted store, as in `ActorSystem(store_key=...)`.
         breaks: stop in pdb before the handler of the last turn.
         told: is called with each turn when it has been lived.
 
     Raises:
         SpecError: the program cannot be had, or there is no such address or turn. StoreError: the store cannot be read.
-        StartFailed: the class does not fit what is recorded. HoldfastError: as it says.
+            WrongStoreKey: the key is not the store's. StartFailed: the class does not fit what is recorded.
+            HoldfastError: as it says.
     """
     specs = None if target is None else load_specs(target)
     file = None if recovery is None else load_recovery(recovery)
     with tempfile.TemporaryDirectory(prefix="holdfast-replay-") as folder:
         copy = os.path.join(folder, "copy.db")
-        back_up_store(store, copy)
+        secret = read_store_key(store_key)
+        back_up_store(store, copy, key=secret)
 
         async def replayed() -> ReplayedState:
-            homes = apart(Node("replay", asyncio.get_running_loop()), open_journal(f"sqlite:{copy}"))
+            homes = apart(Node("replay", asyncio.get_running_loop()), open_journal(f"sqlite:{copy}", key=secret))
             try:
-                lives = _known(homes, address)
+                lives = lives_to(_known(homes, address), until)
                 if specs is None:
                     recipe = _recorded(address, lives)
                 else:
@@ -168,11 +173,7 @@ def _chosen(recipe: Recipe | AddressCheck) -> Recipe:
 
 def _recorded(address: str, lives: list[KeptLife]) -> Recipe:
     """The class that is recorded, without arguments."""
-    meta = lives[-1].meta
-    name = meta.made.kind if meta is not None else ""
-    for _, entry in lives[0].saved.entries:
-        if entry[0] == "in" and entry[2] == START:
-            name = name or cast("bytes", entry[4]).decode()
+    name = next((one.kind for one in reversed(lives) if one.kind), "")
     hint = "name the specs of its program with --spec"
     find_in(os.getcwd())
     try:
@@ -213,7 +214,7 @@ class _Replay:
 
     async def lived(self, lives: list[KeptLife], since: int | None, until: int | None) -> ReplayedState:
         """Live the turns of the latest life from which those that are wanted can be reached."""
-        kept = [-1 if one.meta is None else one.meta.turn for one in lives]
+        kept = [one.turn for one in lives]
         first = kept[0] if since is None else max((turn for turn in kept if turn < since), default=kept[0])
         rerun = Rerun(self._homes, self._address, self._recipe, lives[kept.index(first)].saved)
         last = rerun.ledger.turn

@@ -27,6 +27,7 @@ NAMED = "tests/control/test_named_children.py"
 FAR_NAMED = "tests/control/test_far_names.py"
 SLOW = "tests/supervision/test_slow_restarts.py"
 UPGRADE = "tests/system/upgrade/test_check_upgrade.py"
+SAME_CLASS = "tests/system/upgrade/test_same_class_everywhere.py"
 COLLECTIONS = "tests/system/test_full_collections.py"
 CHANGES = "tests/effects/test_changes_of_races.py"
 ORDERS = "tests/effects/test_orders_while_resting.py"
@@ -533,6 +534,20 @@ CHECKS = {
         "            pass  # What follows",
         UPGRADE,
         "test_a_change_is_told and another and reply",
+    ),
+    "turns of a class that was replaced are not checked with the one in its place": Check(
+        "checkpoint/store_tools/upgrade_check.py",
+        "    lives, replaced = lives_of(lives, recipe.start.kind)\n",
+        "    lives, replaced = lives, lives_of(lives, recipe.start.kind)[1]\n",
+        SAME_CLASS,
+        "agree and stopped",
+    ),
+    "a replay begins behind what was put in place": Check(
+        "system/upgrade/replayed_actor.py",
+        "lives_to(_known(homes, address), until)",
+        "_known(homes, address)",
+        SAME_CLASS,
+        "agree and stopped",
     ),
     "a state that was put in place is not compared": Check(
         "checkpoint/store_tools/upgrade_check.py",
