@@ -107,6 +107,11 @@ class Program(Actor):
         self._silence: SilenceWatch | None = None
         self._since = 0.0
 
+    @property
+    def lines_to(self) -> str | None:
+        """Who is told each line of it: an address, or a registered name."""
+        return self._order.lines_to
+
     # -- start ------------------------------------------------------------------------------------------------------
 
     async def on_start(self, restored: bool) -> None:

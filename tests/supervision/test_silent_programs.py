@@ -48,7 +48,7 @@ async def test_one_that_is_stopped_by_a_signal_is_restarted(system: hf.ActorSyst
         os.kill(pid, signal.SIGSTOP)
         reason = await ended(events)
         assert isinstance(reason, hf.Hung)
-        assert 0.5 <= reason.seconds
+        assert reason.seconds >= 0.5
         assert str(reason) == f"hung for {reason.seconds:g} s: it has printed nothing"
         await beats(events, 3)
     assert (await info(system, path)).pid != pid
@@ -91,7 +91,10 @@ async def test_one_whose_lines_wait_for_their_receiver_is_not_silent(system: hf.
 
 
 async def test_its_silence_counts_from_when_it_is_ready_until_it_is_to_end(system: hf.ActorSystem) -> None:
-    script = "import time, signal, os\nsignal.signal(15, lambda *_: (time.sleep(0.5), os._exit(7)))\ntime.sleep(0.5)\n" + BEATS
+    script = (
+        "import time, signal, os\nsignal.signal(15, lambda *_: (time.sleep(0.5), os._exit(7)))\ntime.sleep(0.5)\n"
+        + BEATS
+    )
     with system.events() as events:
         ref = await system.start(python(script, ready="beat", silent_after=0.2, restart="temporary", shutdown=5.0))
         await system.stop(ref)
