@@ -25,6 +25,13 @@ KINDS = "tests/diagnosis/observers/test_kinds.py"
 PROGRAM_LINES = "tests/diagnosis/live/test_program_lines.py"
 
 CHECKS = {
+    "what is seen again behind a grace is not taken back": Check(
+        "diagnosis/observers/observer.py",
+        "if settled is not None or literal is None or literal != word.said:",
+        "if True:",
+        "tests/diagnosis/observers/test_observers.py",
+        "still_is_not_taken_back",
+    ),
     "a program that starts has much to say": Check(
         "diagnosis/observers/flow.py",
         "is_steady = not made.is_lines or learned.seconds > STEADY",
