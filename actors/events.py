@@ -577,6 +577,30 @@ Restful = Literal["letters", "starts", "others"]
 """Dead letters, the first lives at addresses, and all other events: what a recorder may rest from."""
 
 
+class RepairGaveUp(Event, frozen=True, eq=False):
+    """Repair has given components up: a person has to look at them, and `plan` says what to try."""
+
+    components: tuple[str, ...]
+    why: str
+    plan: tuple[str, ...] = ()
+
+
+class RepairTold(Event, frozen=True, eq=False):
+    """What repair has told of a case, as one sentence; `what` is the kind of the notice, such as "Planned"."""
+
+    case: int
+    what: str
+    text: str
+
+
+class NotDelivered(Event, frozen=True, eq=False):
+    """The other side could not be reached, or refuses: it is tried again, unless `is_given_up`."""
+
+    url: str
+    why: str
+    is_given_up: bool = False
+
+
 class EventStream:
     """One listener's view: an async iterator over events, with a bound on how far it may fall behind.
 

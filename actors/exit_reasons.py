@@ -157,12 +157,13 @@ class OutOfMemory(ExitReason, frozen=True):
 
 
 class Hung(ExitReason, frozen=True):
-    """The process's loop stopped beating for this many seconds."""
+    """The process gave no sign of life for this many seconds: its loop stopped beating, or a program was silent."""
 
     seconds: float
+    text: str = ""
 
     def __str__(self) -> str:
-        return f"hung for {self.seconds:g} s"
+        return f"hung for {self.seconds:g} s: {self.text}" if self.text else f"hung for {self.seconds:g} s"
 
 
 class NoConnection(ExitReason, frozen=True):
@@ -231,8 +232,8 @@ def pack_exit(reason: ExitReason) -> dict[str, object]:
             return {"exit": "Exited", "number": code}
         case OutOfMemory(text=text):
             return {"exit": "OutOfMemory", "text": text}
-        case Hung(seconds=seconds):
-            return {"exit": "Hung", "seconds": seconds}
+        case Hung(seconds=seconds, text=text):
+            return {"exit": "Hung", "seconds": seconds, "text": text}
         case TrustBreach(problem=problem):
             return {"exit": "TrustBreach", "text": problem}
         case NoConnection(node=node):
@@ -268,7 +269,7 @@ def unpack_exit(data: object) -> ExitReason:
         case "OutOfMemory":
             return OutOfMemory(wire.text)
         case "Hung":
-            return Hung(wire.seconds)
+            return Hung(wire.seconds, wire.text)
         case "NoConnection":
             return NoConnection(wire.text)
         case "TrustBreach":

@@ -37,6 +37,7 @@ from .messages import DIAGNOSIS, EXPLANATION, GRACE, MODEL, OBSERVATIONS, REPAIR
 from .model import Component, Declaration, Expectation, Kind, ModelError
 from .observers.flow import MOST_ARRIVALS, Arrival, Baselines, FlowObserver, FlowSource
 from .observers.hearing import Heard, listen
+from .observers.lines import hear_lines, lines_topic, told_lines
 from .observers.node_observer import NodeObserver
 from .observers.observer import Manner, Observer
 from .observers.replicas import ReplicaObserver
@@ -192,7 +193,8 @@ def _made(wiring: Mapping[str, Wired], known: Collection[str]) -> dict[str, Flow
     for topic in sorted(published):
         makers = [wired for wired in wiring.values() if topic in wired.publishes]
         inputs = {one for wired in makers for one in wired.subscribes if one in known and one != topic}
-        made[topic] = FlowSource(tuple(wired.path for wired in makers), tuple(sorted(inputs)))
+        is_lines = any(topic == lines_topic(wired.path) for wired in makers)
+        made[topic] = FlowSource(tuple(wired.path for wired in makers), tuple(sorted(inputs)), is_lines)
     return made
 
 
@@ -208,13 +210,20 @@ class TopicListener(Actor):
         """Subscribe to the topics that are to be listened to."""
         for topic in self._listens_to:
             listen(self, topic)
+        self.ctx.create_task(hear_lines(self.ctx._cell.node, self._heard_line))
+
+    def _heard_line(self, program: str) -> None:
+        self._note(lines_topic(program), program)
 
     @on(Heard)
     def _heard(self, message: Heard) -> None:
-        if message.sender is not None:
-            self._publishers.setdefault(message.sender, set()).add(message.topic)
+        self._note(message.topic, message.sender)
+
+    def _note(self, topic: str, sender: str | None) -> None:
+        if sender is not None:
+            self._publishers.setdefault(sender, set()).add(topic)
         if len(self._arrivals) < MOST_ARRIVALS:
-            self._arrivals.append((message.topic, self.ctx._cell.node.loop.time()))
+            self._arrivals.append((topic, self.ctx._cell.node.loop.time()))
 
 
 def _wiring(
@@ -225,7 +234,11 @@ def _wiring(
         return {}
     cells = [cell for cell in _below(root, out) if not _is_ours(cell)]
     names = {cell.path: component_for(cell.path[len(root.path) + 1 :]) for cell in cells}
-    return {names[cell.path]: _wired(cell, names, heard, asked) for cell in cells}
+    lines: dict[str, set[str]] = {}
+    for cell in cells:
+        if (to := told_lines(cell)) is not None:
+            lines.setdefault(to, set()).add(lines_topic(cell.path))
+    return {names[cell.path]: _wired(cell, names, heard, asked, lines.get(cell.path, set())) for cell in cells}
 
 
 def _below(cell: Cell, out: Collection[str]) -> Iterator[Cell]:
@@ -252,7 +265,9 @@ def _is_ours(cell: Cell) -> bool:
     return module.startswith(BASE) and not module.startswith(f"{__package__}.board.")
 
 
-def _wired(cell: Cell, names: dict[str, str], heard: dict[str, set[str]], asked: Mapping[str, set[str]]) -> Wired:
+def _wired(
+    cell: Cell, names: dict[str, str], heard: dict[str, set[str]], asked: Mapping[str, set[str]], lines: set[str]
+) -> Wired:
     more, kind = cell.more, cell_kind(cell)
     bound = more.bindings if more is not None else {}
     return Wired(
@@ -260,7 +275,7 @@ def _wired(cell: Cell, names: dict[str, str], heard: dict[str, set[str]], asked:
         kind="" if kind is None else f"{kind.__module__}.{kind.__qualname__}",
         supervisor=None if cell.parent is None else cell.parent.path,
         publishes=tuple(sorted(heard.get(cell.path, ()))),
-        subscribes=tuple(sorted(set(more.belongings.topics) - OURS if more is not None else ())),
+        subscribes=tuple(sorted(lines | (set(more.belongings.topics) - OURS if more is not None else set[str]()))),
         bound={port: names[target.path] for port, target in sorted(bound.items()) if target.path in names},
         asks=tuple(sorted(asked.get(names[cell.path], set()) & set(names.values()))),
         is_protected=has_replicas(cell),

@@ -24,6 +24,7 @@ from typing import NamedTuple
 import pytest
 
 import holdfast
+import holdfast.events as hf_events
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
@@ -254,6 +255,15 @@ def test_errors_and_events_are_all_explained(room: str) -> None:
     text = (ROOT / "docs" / f"{room}.md").read_text("utf-8")
     names = importlib.import_module(f"holdfast.{room}").__all__
     assert not [name for name in names if f"{name}`" not in text]
+
+
+def test_each_event_that_a_document_names_is_among_the_events() -> None:
+    declared = re.compile(r"^class (\w+)\(Event\b", re.M)
+    events = {name: module for module in MODULES for name in declared.findall(source_of(module).read_text())}
+    for document in DOCUMENTS:
+        for name in re.findall(r"`(?:hf\.events\.)?(\w+)(?:\([^`]*\))?`", document.read_text()):
+            assert name not in events or name in hf_events.__all__, f"{document.name} calls {name} an event"
+    assert len(events) > 90, "they are found"
 
 
 def test_the_reference_has_every_public_name() -> None:

@@ -10,20 +10,11 @@ from urllib.parse import urlsplit
 
 from ...actors.backoff import Backoff
 from ...actors.errors import SpecError
-from ...actors.events import Event
 from ...actors.streams import is_loopback
 
 PATIENCE: Final = 10.0
 """Seconds that the other side may take to answer."""
 NEEDS: Final = "a bridge needs the library aiohttp: pip install 'holdfast[bridges]'"
-
-
-class NotDelivered(Event, frozen=True, eq=False):
-    """The other side could not be reached, or refuses: it is tried again, unless `is_given_up`."""
-
-    url: str
-    why: str
-    is_given_up: bool = False
 
 
 def http_client() -> Any:

@@ -13,9 +13,10 @@ import msgspec
 
 from ...actors.backoff import Backoff
 from ...actors.errors import SpecError
+from ...actors.events import NotDelivered
 from ...actors.kernel.actor import Actor, on, subscribe
 from ..messages import ROS_DIAGNOSTICS, RosDiagnostics
-from .delivery import PATIENCE, NotDelivered, check_url, http_client, keep_trying
+from .delivery import PATIENCE, check_url, http_client, keep_trying
 
 TYPE: Final = "diagnostic_msgs/msg/DiagnosticArray"
 EVERY: Final = 1.0

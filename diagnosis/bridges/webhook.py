@@ -8,10 +8,11 @@ from typing import Any, Final
 import msgspec
 
 from ...actors.backoff import Backoff
+from ...actors.events import NotDelivered
 from ...actors.kernel.actor import Actor, on, subscribe
 from ..engine import Diagnosis
 from ..messages import DIAGNOSIS
-from .delivery import PATIENCE, NotDelivered, check_url, http_client, keep_trying
+from .delivery import PATIENCE, check_url, http_client, keep_trying
 from .payload import WebhookAlert, fingerprint_of, payload_of, rfc3339
 
 MOST_ALERTS: Final = 1000

@@ -19,6 +19,7 @@ from ..kept_file import read_kept, write_kept
 from ..literals import ok, word_for
 from ..own_time import OwnTime
 from .hearing import Heard, listen
+from .lines import hear_lines, lines_topic
 from .observer import Manner, Observer
 
 ENOUGH: Final = 20
@@ -39,6 +40,8 @@ BLOCKS: Final = 6
 """Blocks from which it is known how much goes out at least."""
 TOO_OFTEN: Final = 3
 """Silences that were told as faults, and have ended by themselves, after which the next ones are usual."""
+STEADY: Final = 5.0
+"""Seconds for which a program must have printed before its lines go by a clock: one that starts has much to say."""
 MOST_ARRIVALS: Final = 50_000
 """Messages that are noted while nobody observes yet."""
 Arrival = tuple[str, float]
@@ -131,10 +134,14 @@ class Baselines:
 
 
 class FlowSource(msgspec.Struct, frozen=True):
-    """How a topic comes about: the addresses of its publishers, and the topics that all they publish is made from."""
+    """How a topic comes about: the addresses of its publishers, and the topics that all they publish is made from.
+
+    `is_lines`: it is what a program prints, which is silent for too long only if it has gone by a clock.
+    """
 
     publishers: tuple[str, ...]
     inputs: tuple[str, ...] = ()
+    is_lines: bool = False
 
 
 class _Flow:
@@ -245,7 +252,13 @@ class FlowObserver(Observer):
         self._time = OwnTime(self.ctx._cell.node.loop)
         if self.ctx._cell.node.clock.is_monotonic:  # Else it jumps from moment to moment, and is never late.
             self.ctx.create_task(self._time.keep())
+        self.ctx.create_task(hear_lines(self.ctx._cell.node, self._heard_line))
         super().on_start(restored)
+
+    def _heard_line(self, program: str) -> None:
+        topic = lines_topic(program)
+        self._heard_of.setdefault(program, set()).add(topic)
+        self._arrived(topic, self._time.now())
 
     @on(Heard)
     def _heard(self, message: Heard) -> Any:
@@ -335,7 +348,7 @@ class FlowObserver(Observer):
         works = [cell.host.work(cell) for cell in cells]
         flow.look_at(cells)
         if not flow.inputs:  # Its publishers' turns are what comes in.
-            had_turns = len(works) == len(flow.works) and any(map(_had_turns, flow.works, works))
+            had_turns = not made.is_lines and len(works) == len(flow.works) and any(map(_had_turns, flow.works, works))
             flow.came_in, flow.works = flow.came_in + had_turns, works
             for cell in cells:
                 cell.host.ask_turns(cell)  # for the next look
@@ -346,7 +359,8 @@ class FlowObserver(Observer):
             return True if silent < self._patience else None
         is_long = silent > max(self._patience, LONGER * learned.longest_gap)
         is_due = flow.came_in > ENOUGH // 2 + LONGER * flow.most_in(learned)
-        is_by_clock = not flow.inputs and learned.goes_by_clock
+        is_steady = not made.is_lines or learned.seconds > STEADY
+        is_by_clock = not flow.inputs and is_steady and learned.goes_by_clock
         if (is_due and silent > self._patience) or (is_by_clock and is_long):
             flow.is_missed = True
             return False

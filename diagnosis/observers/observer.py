@@ -117,7 +117,9 @@ class Observer(Actor):
         word = self._words.get(about)
         if word is None:
             word = self._words[about] = _Word(self.manner.agreement)
-        self._settle(word, word.debounce(literal))
+        settled = word.debounce(literal)
+        if settled is not None or literal is None or literal != word.said:  # What is seen again is not taken back.
+            self._settle(word, settled)
 
     def said(self, about: Literal) -> bool | None:
         """What was settled of an atom: it holds, or does not, or (None) it is unknown."""

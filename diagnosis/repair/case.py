@@ -60,6 +60,9 @@ class Case:
         blamed: whom the present plan is for.
         midway: whom it has begun to act on.
         before_plan: how many actions there were before the present plan.
+        aims: the symptoms that the present plan is to mend.
+        seen_again: those of them that were said again behind the grace of what was done.
+        is_vain: the present plan was counted as one that has not helped.
         undos: how the present plan can be taken back, newest last.
         advised: the advice for each candidate.
         useless: places of actions that were seen not to help.
@@ -82,6 +85,9 @@ class Case:
     blamed: frozenset[str] = frozenset()
     midway: set[str] = dataclasses.field(default_factory=set[str])
     before_plan: int = 0
+    aims: frozenset[Literal] = frozenset()
+    seen_again: set[Literal] = dataclasses.field(default_factory=set[Literal])
+    is_vain: bool = False
     undos: list[tuple[Step, Undo]] = dataclasses.field(default_factory=list[tuple[Step, Undo]])
     advised: dict[tuple[str, ...], Advice] = dataclasses.field(default_factory=dict[tuple[str, ...], Advice])
     useless: set[int] = dataclasses.field(default_factory=set[int])
@@ -106,22 +112,28 @@ class Case:
         was, self.held = self.held, why
         return was == why
 
-    def begin_plan(self, bad: tuple[str, ...]) -> None:
-        """A plan for a candidate is carried out from now on."""
+    def begin_plan(self, bad: tuple[str, ...], symptoms: Iterable[Literal]) -> None:
+        """A plan for a candidate, which is to mend these symptoms, is carried out from now on."""
         self.rounds += 1
         self.before_plan = len(self.actions)
         self.tried[bad] = self.tried.get(bad, 0) + 1
         self.blamed, self.midway, self.undos = frozenset(bad), set(), []
+        self.aims, self.seen_again, self.is_vain = frozenset(symptoms), set(), False
 
     def take_carried_out(self) -> tuple[Step, ...]:
         """The steps of the present plan that were begun, once: then they are judged."""
         steps, self.before_plan = tuple(self.actions[self.before_plan :]), len(self.actions)
         return steps
 
-    def note_useless(self, steps: tuple[Step, ...], certain: Collection[str]) -> None:
-        """The steps that were taken last to be judged have not helped those that are certainly bad still."""
-        begin = self.before_plan - len(steps)
-        self.useless.update(begin + nth for nth, step in enumerate(steps) if step.args and step.args[0] in certain)
+    def note_useless(self, names: Collection[str]) -> None:
+        """The steps of the present plan on these components have not helped."""
+        begun = range(self.before_plan, len(self.actions))
+        self.useless.update(place for place in begun if set(self.actions[place].args[:1]) & set(names))
+
+    def count_vain(self) -> bool:
+        """Whether the present plan counts from now on as one that has not helped; once."""
+        was, self.is_vain = self.is_vain, True
+        return not was and self.before_plan < len(self.actions)
 
     def helpful(self) -> tuple[Step, ...]:
         """The actions that were done, but for those that were seen not to help."""

@@ -12,6 +12,7 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import Final, NamedTuple
 
 from ..engine import State
+from ..literals import Literal
 from ..model import Model
 from ..planning import Plan, Step, TimedOut, Unsolvable
 from .case import Case, Finishing, HeldByMode, Phase, Unclear, Verifying, Watching
@@ -220,6 +221,30 @@ def is_unsure(case: Case, model: Model, outlook: Outlook, now: float) -> bool:
     """
     seen = (outlook.seen(atom, now) for atom in model.dependents(case.tries))
     return any(when >= case.began and not value for value, when in seen)
+
+
+def seen_again(case: Case, outlook: Outlook, now: float) -> set[Literal]:
+    """The symptoms that the present plan was to mend, and that are diagnosed by words from behind its grace."""
+    if not isinstance(case.phase, Verifying) or outlook.diagnosis.state is not State.FAULTY:
+        return set()
+    behind = max(case.phase.since, outlook.graced)
+    said = {
+        word.literal
+        for symptom in outlook.diagnosis.symptoms
+        for word in outlook.observations.words(symptom)
+        if word.time > behind and word.is_current(now)
+    }
+    return {symptom for symptom in case.aims if symptom in said}
+
+
+def vain_in(case: Case, model: Model) -> set[str]:
+    """Whom the present plan has touched in vain: all that it was to mend there was seen again, whatever comes later."""
+    vain = set[str]()
+    for name in case.midway:
+        theirs = case.aims & {literal for atom in model.dependents((name,)) for literal in (atom, ~atom)}
+        if theirs and theirs <= case.seen_again:
+            vain.add(name)
+    return vain
 
 
 def why_overtaken(step: Step, case: Case, outlook: Outlook, policy: Policy, mode: str, now: float) -> str:

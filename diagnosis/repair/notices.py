@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import msgspec
 
-from ...actors.events import Event
+from ...actors.events import RepairGaveUp, RepairTold
 from ...actors.kernel.message import Message, Refusal, RuntimeOrder
 from ..literals import Literal
 from ..messages import REPAIR, Touched
@@ -107,22 +107,6 @@ class GaveUp(Message):
     actions: tuple[Step, ...]
     seconds: float
     plan: tuple[str, ...] = ()
-
-
-class RepairGaveUp(Event, frozen=True, eq=False):
-    """Repair has given components up: a person has to look at them, and `plan` says what to try."""
-
-    components: tuple[str, ...]
-    why: str
-    plan: tuple[str, ...] = ()
-
-
-class RepairTold(Event, frozen=True, eq=False):
-    """What repair has told of a case, as one sentence; `what` is the kind of the notice, such as "Planned"."""
-
-    case: int
-    what: str
-    text: str
 
 
 class Approve(RuntimeOrder[None]):

@@ -41,7 +41,7 @@ from . import notices as say
 from .actions import Act, RepairAction, Repertoire
 from .advice import Advice, judge_advice
 from .approvals import Approvals, Approver
-from .case import Case, Finishing, Verifying, Watching, base_of, reached
+from .case import Case, Watching, base_of, reached
 from .choice import CaseView, choose, components_of, problem_for
 from .executor import DONE, SKIPPED, UNVERIFIED, Executor, Result
 from .harmless import harmless_part
@@ -346,6 +346,7 @@ class Repairer(Actor):
             await self._tell(say.RepairBegan(case.number, chosen, case.symptoms))
             decision: deciding.Decision | None = None
             while not isinstance(decision, deciding.Close):
+                self._note_vain(case)
                 decision = await self._carry_out(
                     case, decision or deciding.decide(case, self._moment(case), self._policy)
                 )
@@ -365,7 +366,7 @@ class Repairer(Actor):
             case deciding.Wait(seconds, wakes):
                 await self._sleep(seconds, wakes=wakes)
             case deciding.Enter(phase, held):
-                if isinstance(case.phase, (Verifying, Finishing)) and self._outlook.diagnosis.state is State.FAULTY:
+                if case.phase is not None and self._outlook.diagnosis.state is State.FAULTY:
                     await self._take_back(case)
                 case.enter(phase, self.now())
                 if held:
@@ -413,7 +414,7 @@ class Repairer(Actor):
             return deciding.Enter(Watching(bad))
         if (answered := await self._approved_by(case, bad, outcome)) is not None:
             return answered
-        case.begin_plan(bad)
+        case.begin_plan(bad, self._outlook.diagnosis.symptoms)
         results = await self._executor(case).execute(problem, outcome)
         case.failures += [f"{result.step} {result.outcome}: {result.why}" for result in results if result.why]
         case.undos = [(result.step, result.undo) for result in results if result.undo is not None]
@@ -484,14 +485,25 @@ class Repairer(Actor):
                 return
             await self._sleep(math.inf if is_wanted else left, wakes=True)
 
+    def _note_vain(self, case: Case) -> None:
+        """What was seen not to help has no credit if the symptoms go by themselves before the plan is judged."""
+        again = deciding.seen_again(case, self._outlook, self.now())
+        if not again <= case.seen_again:
+            case.seen_again |= again
+            vain = deciding.vain_in(case, self._model)
+            case.note_useless(vain)
+            if vain and vain >= case.midway:
+                self._memory.useless += case.count_vain()
+
     async def _take_back(self, case: Case) -> None:
         """If the plan has not helped, count it, and undo of it what can be undone, the newest first."""
         suspects = set(self._outlook.diagnosis.suspects)
-        steps = case.take_carried_out()  # Of a plan that was skipped there are none.
-        if not steps or not suspects & case.midway:
-            return  # It was judged before, or others are blamed now: it may have helped.
-        self._memory.useless += 1
-        case.note_useless(steps, self._outlook.diagnosis.certain)
+        if is_blamed := bool(suspects & case.midway):  # Else it may have helped.
+            case.note_useless(self._outlook.diagnosis.certain)
+            self._memory.useless += case.count_vain()
+        steps = case.take_carried_out()  # Of a plan that was skipped, or judged before, there are none.
+        if not steps or not is_blamed:
+            return
         node, now = self.ctx._cell.node, self.now()
         for step in steps:
             address = self._addresses.get(step.args[0]) if step.args and step.args[0] in suspects else None

@@ -56,7 +56,7 @@ def sentence(notice: Message) -> str:
         case say.Held(_, why):
             return f"Repair waits: {why}."
         case say.Repaired(_, actions, seconds):
-            by = f" by {_names(map(str, actions))}" if actions else " by itself"
+            by = f" by {_names(map(str, actions))}" if actions else " by themselves"
             return f"The symptoms went{by} within {seconds:.1f} s."
         case say.AdviceScored(_, verdict, seconds):
             saved = f", which came {seconds:.1f} s before somebody did it" if seconds else ""

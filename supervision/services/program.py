@@ -32,6 +32,7 @@ from ..rules import Rule
 from ..spec import ChildSpec, Restart, Shutdown, child
 from .program_lines import LineSender, receiver_in
 from .readiness import ReadySign, Sign, by_name, reached
+from .silence import SilenceWatch
 
 Stop: TypeAlias = int | Sequence[str] | Callable[[int], Awaitable[object] | object]
 """How a program is asked to end: a signal, a command, or a function that is given its pid."""
@@ -86,6 +87,7 @@ class ProgramPlan:
     stdin: bool
     lines_to: str | None
     log_lines: bool
+    silent_after: float | None = None
 
 
 class Program(Actor):
@@ -101,7 +103,14 @@ class Program(Actor):
         self._parts: dict[str, str] = {}  # of lines that have no end yet, by stream
         self._sign: Sign | None = None
         self._sender: LineSender | None = None
+        self._is_held = False
+        self._silence: SilenceWatch | None = None
         self._since = 0.0
+
+    @property
+    def lines_to(self) -> str | None:
+        """Who is told each line of it: an address, or a registered name."""
+        return self._order.lines_to
 
     # -- start ------------------------------------------------------------------------------------------------------
 
@@ -129,6 +138,10 @@ class Program(Actor):
         self._is_up = True
         if kept.ended.done():  # At once: nobody was there yet to be told.
             self.ctx.stop(kept.ended.result())
+        elif order.silent_after is not None:
+            loop = cell.node.loop
+            self._silence = SilenceWatch(loop, kept.pid, order.silent_after, self._is_kept_quiet, self._hangs)
+            kept.ended.add_done_callback(self._listen_no_more)
 
     def _keep(
         self, command: Sequence[str], more: Mapping[str, str] | None = None, *, stdin: bool = False
@@ -187,8 +200,23 @@ class Program(Actor):
 
     # -- while it runs ----------------------------------------------------------------------------------------------
 
+    def _is_kept_quiet(self) -> bool:
+        """Whether it is not to be heard now: its lines wait for their receiver, or its actor is suspended."""
+        more = self.ctx._cell.more
+        return self._is_held or (more is not None and more.suspended != 0)
+
+    def _hangs(self, seconds: float) -> None:
+        if self._kept is not None:
+            self._kept.kill(exit_reasons.Hung(round(seconds, 3), "it has printed nothing"))
+
+    def _listen_no_more(self, ended: object = None) -> None:
+        if self._silence is not None:
+            self._silence.close()
+
     def _line(self, stream: str, text: str) -> None:
         self._lines.append(text)
+        if self._silence is not None:
+            self._silence.heard()
         self._parts.pop(stream, None)
         node = self.ctx._cell.node
         if node.events.hears_lines:
@@ -199,15 +227,19 @@ class Program(Actor):
             self._sign.line(text)
 
     def _hold(self) -> None:
+        self._is_held = True
         if self._kept is not None:
             self._kept.hold_output()
 
     def _go_on(self) -> None:
+        self._is_held = False
         if self._kept is not None:
             self._kept.let_output_go_on()
 
     def _part(self, stream: str, text: str, whole: str) -> None:
         """A line that has no end yet; it comes again. What came before of a very long one is there in `whole`."""
+        if text and text != self._parts.get(stream) and self._silence is not None:
+            self._silence.heard()
         self._parts[stream] = text
         if whole and self._sign is not None:
             self._sign.line(whole)
@@ -257,6 +289,7 @@ class Program(Actor):
     async def on_stop(self, reason: ExitReason) -> None:
         """End the program: as it wants to be asked, then SIGTERM to its group, then SIGKILL to all that is left."""
         kept = self._kept
+        self._listen_no_more()
         if kept is None or kept.ended.done():
             return
         patience = _seconds(self._order.shutdown)
@@ -344,6 +377,7 @@ def program(
     stdin: bool = False,
     lines_to: ActorRef[Any] | str | None = None,
     log_lines: bool = True,
+    silent_after: float | None = None,
     restart: Restart = "permanent",
     shutdown: Shutdown = 5.0,
     backoff: Backoff | None = None,
@@ -376,6 +410,10 @@ def program(
             seconds and a thousand of them at most. What nobody can take is a dead letter.
         log_lines: whether each line of its output is written to the log, too; `holdfast logs` shows the last ones in
             any case.
+        silent_after: seconds without any output, once it is ready, after which it hangs: it is ended by SIGKILL, as
+            `Hung`, and restarted as if it had crashed. None: it may be silent for ever. What it is told is no output.
+            Time in which this process is late, its lines wait for their receiver, or its actor is suspended does not
+            count.
         restart, backoff, significant, rules: as in `child`.
         shutdown: seconds it may take to end before it is ended by SIGKILL, "brutal_kill" or "infinity".
         limits: of the program itself; `hung_after` does not apply.
@@ -394,7 +432,9 @@ def program(
     if limits is not None and not isinstance(limits, Limits):
         raise SpecError(where, f"limits must be Limits(...) or left out, not {limits!r}")
     if limits is not None and limits.hung_after is not None:
-        raise SpecError(where, "limits.hung_after is for actors: a program has no heartbeat")
+        raise SpecError(where, "limits.hung_after is for actors: a program has no heartbeat; say silent_after=")
+    if silent_after is not None:
+        silent_after = check_seconds(where, "silent_after", silent_after)
     directory = _directory_in(where, cwd)
     if isinstance(ready, Path) and directory is not None:
         ready = Path(directory, ready)
@@ -410,6 +450,7 @@ def program(
         stdin,
         receiver_in(where, lines_to),
         log_lines,
+        silent_after,
     )
     # The actor does the counting, for a kill of the actor must not come before that of the program.
     own = child(

@@ -22,8 +22,30 @@ FOREIGN = "tests/diagnosis/foreign/test_foreign.py"
 
 CIRCLES = "tests/diagnosis/observers/test_circles.py"
 KINDS = "tests/diagnosis/observers/test_kinds.py"
+PROGRAM_LINES = "tests/diagnosis/live/test_program_lines.py"
 
 CHECKS = {
+    "what is seen again behind a grace is not taken back": Check(
+        "diagnosis/observers/observer.py",
+        "if settled is not None or literal is None or literal != word.said:",
+        "if True:",
+        "tests/diagnosis/observers/test_observers.py",
+        "still_is_not_taken_back",
+    ),
+    "a program that starts has much to say": Check(
+        "diagnosis/observers/flow.py",
+        "is_steady = not made.is_lines or learned.seconds > STEADY",
+        "is_steady = True",
+        PROGRAM_LINES,
+        "",
+    ),
+    "what a program prints is an input of its reader": Check(
+        "diagnosis/generate.py",
+        "            lines.setdefault(to, set()).add(lines_topic(cell.path))\n",
+        "            pass\n",
+        PROGRAM_LINES,
+        "",
+    ),
     "who does something else is in no circle": Check(
         "diagnosis/observers/runtime.py",
         " for to in left[component] if self._actors[to] == awaited)",

@@ -330,6 +330,8 @@ BAD: list[tuple[Any, dict[str, Any], str]] = [
     (["x"], {"backoff": 1}, "backoff must be"),
     (["x"], {"limits": 1}, "limits must be"),
     (["x"], {"limits": hf.Limits(hung_after=1)}, "a program has no heartbeat"),
+    (["x"], {"silent_after": 0}, "silent_after must be"),
+    (["x"], {"silent_after": True}, "silent_after must be"),
     (["x"], {"significant": True}, "a permanent child cannot be significant"),
 ]
 

@@ -23,6 +23,7 @@ SUPERVISORS = "tests/migration/test_moved_supervisors.py"
 KINDS = "tests/migration/test_moved_kinds.py"
 JOURNALS = "tests/supervision/test_dynamic_journal.py"
 LINES = "tests/supervision/test_program_lines.py"
+SILENT = "tests/supervision/test_silent_programs.py"
 NAMED = "tests/control/test_named_children.py"
 FAR_NAMED = "tests/control/test_far_names.py"
 SLOW = "tests/supervision/test_slow_restarts.py"
@@ -52,6 +53,41 @@ UNCODABLE = "tests/system/test_uncodable.py"
 SHUTDOWN = "tests/supervision/test_shutdown.py"
 
 CHECKS = {
+    "who is kept from being heard is not silent": Check(
+        "supervision/services/program.py",
+        "        return self._is_held or (more is not None and more.suspended != 0)\n",
+        "        return more is not None and more.suspended != 0\n",
+        SILENT,
+        "wait_for_their_receiver",
+    ),
+    "who is suspended may be silent": Check(
+        "supervision/services/program.py",
+        "        return self._is_held or (more is not None and more.suspended != 0)\n",
+        "        return self._is_held\n",
+        SILENT,
+        "suspended",
+    ),
+    "who is to end may be silent": Check(
+        "supervision/services/program.py",
+        "        self._listen_no_more()\n",
+        "",
+        SILENT,
+        "until_it_is_to_end",
+    ),
+    "a line without an end is a sign of life": Check(
+        "supervision/services/program.py",
+        "        if text and text != self._parts.get(stream) and self._silence is not None:\n",
+        "        if False and self._silence is not None:\n",
+        SILENT,
+        "whatever_it_prints",
+    ),
+    "whoever was late himself has heard no silence": Check(
+        "supervision/services/silence.py",
+        "        now = self._clock.tick(self._loop.time())\n",
+        "        now = self._clock.tick(self._loop.time()) + self._clock.lag\n",
+        SILENT,
+        "this_process_was_late",
+    ),
     "the life that has obeyed an order is the one that goes on": Check(
         "system/live_moves.py",
         "        future.add_done_callback(lambda done: gate.close())  # Who has obeyed goes on.\n",

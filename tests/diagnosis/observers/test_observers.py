@@ -394,6 +394,16 @@ async def test_nothing_bad_is_said_in_the_grace_after_an_action(system: hf.Actor
     assert seen.changes()[-1] == "ok(/t)"  # what is good is said at once
 
 
+async def test_what_is_good_still_is_not_taken_back_behind_an_action(system: hf.ActorSystem) -> None:
+    ref: hf.ActorRef[Source_] = await system.start(hf.child("x", hf.start(Source_)))
+    manner = Manner(every=0.5, agreement=Agreement(2, 3))
+    seen = await watch(system, NodeObserver, {"x": ref.path}, manner=manner)
+    await advance(3.0)
+    await seen.publish(GRACE, Grace(("x",), 0.1))
+    await advance(8.0)
+    assert seen.changes() == ["running(x)"]
+
+
 async def test_after_an_action_a_trend_is_looked_for_anew(system: hf.ActorSystem) -> None:
     # T51: a line through before and after would rise.
     seen = await watch(system, QualitativeObserver, "v", "/t", "x", slope=0.5, window=2.0, manner=QUICK)

@@ -183,7 +183,7 @@ class Repair(RuleBasedStateMachine):
             none = TimedOut(5.0, "too slow") if found == "late" else Unsolvable((), False, "there is none")
             return judge_no_plan(case, bad, none, self.mode, POLICY)
         step = Step("mend", (bad[0],))
-        case.begin_plan(bad)
+        case.begin_plan(bad, ())
         case.count(step)
         self.now += 0.5
         if outcome == DONE and helps:

@@ -44,7 +44,7 @@ from holdfast.diagnosis.repair import (
     action,
 )
 from holdfast.supervision.arbiter import Hand, arbiter_of
-from tests.diagnosis.repair.simulated import Scene, World, now, scene, watcher
+from tests.diagnosis.repair.simulated import OBSERVERS, Scene, World, now, scene, watcher
 
 pytestmark = pytest.mark.asyncio(loop_factories=["virtual"])
 
@@ -470,6 +470,38 @@ async def test_what_has_not_helped_is_not_what_the_symptoms_went_by(system: hf.A
     await here.change(lambda world: world.hung.discard("hm"))
     over = await here.hear(Repaired)
     assert (here.done(), over.actions) == (["reset(hm)"], ())
+    assert (await here.repairer.ask(GetRepairStatus())).useless == 1
+
+
+async def test_what_goes_by_itself_is_no_merit_of_an_action_behind_which_it_was_seen_again(
+    system: hf.ActorSystem,
+) -> None:
+    here = await scene(system, Policy(**QUICK), actions=lambda world: vain([], 1))
+    await here.change(lambda world: world.hung.add("hm"))
+    await here.hear(ActionEnded)
+    await asyncio.sleep(3.0)
+    assert not here.all(GaveUp), "it has still time to help"
+    await here.change(lambda world: world.hung.discard("hm"))
+    assert (await here.hear(Repaired)).actions == ()
+    assert (here.done(), here.all(Undone)) == (["reset(hm)"], [])
+    assert (await here.repairer.ask(GetRepairStatus())).useless == 1
+
+
+async def test_what_mends_one_symptom_of_two_has_its_credit(system: hf.ActorSystem) -> None:
+    here = await scene(system, Policy(**QUICK))
+    await here.change(off("hu"))
+    over = await here.hear(Repaired)
+    assert [str(step) for step in over.actions] == here.done()
+
+
+async def test_what_is_seen_again_behind_a_moment_of_blindness_has_not_helped(system: hf.ActorSystem) -> None:
+    here = await scene(system, Policy(unknown=60.0, **QUICK), actions=lambda world: vain([], 1))
+    await here.change(lambda world: world.hung.add("hm"))
+    await here.hear(ActionEnded)
+    await here.blind()
+    await here.hear(Held)
+    await system.ref(OBSERVERS, hf.Supervisor).ask(hf.RestartChild(watcher("/map")))
+    assert str((await here.hear(Undone)).step) == "reset(hm)"
     assert (await here.repairer.ask(GetRepairStatus())).useless == 1
 
 
