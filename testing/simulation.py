@@ -275,9 +275,14 @@ class Simulation:
         Raises:
             SpecError: it has none now.
         """
-        worker = self._roots[-1].system._workers.of(ref._cell)
+        of = self._roots[-1].system._workers.of
+        worker = of(ref._cell)
         if worker is None:
-            raise SpecError(ref.path, "it has no process of its own")
+            above = ref._cell.parent
+            while above is not None and of(above) is None:
+                above = above.parent
+            instead = "" if above is None else f": kill that of {above.path}, in which it lives"
+            raise SpecError(ref.path, f"it has no process of its own{instead}")
         worker.forked.kill()
 
     def stop_recording(self) -> None:

@@ -386,12 +386,12 @@ class ObserveTurns(Order):
 
 
 class Mark(Order):
-    """Do nothing: its turn says that everything before it has been handled."""
+    """Do nothing: its turn says that everything before it has been handled, and how many messages stand behind it."""
 
     verb = "mark"
 
-    def run(self, cell: Cell, actor: Actor) -> None:
-        return None
+    def run(self, cell: Cell, actor: Actor) -> int:
+        return sum(map(mailbox.counts, cell.queue or ()))
 
 
 class Ready(Order):

@@ -79,6 +79,42 @@ async def test_draining_goes_on_over_a_crash(system: hf.ActorSystem, start_one: 
     assert await last == (2 if "recorded" in way else 1)
 
 
+class OnesOwn(hf.Message):
+    left: int
+
+
+class ToItself(Account):
+    """Tells itself the next number until none is left, as `{continue, Term}` would."""
+
+    def __init__(self, told: str) -> None:
+        super().__init__()
+        self.told = told
+
+    @hf.on(OnesOwn)
+    async def own(self, message: OnesOwn) -> None:
+        if message.left:
+            self.ctx.ref.tell(OnesOwn(message.left - 1))
+            await self.ctx.ref.send(OnesOwn(0))
+        with Path(self.told).open("a") as file:
+            file.write(f"{message.left} ")
+
+
+async def test_what_an_actor_tells_itself_while_it_is_drained_is_handled(
+    system: hf.ActorSystem, start_one: Starter, tmp_path: Path
+) -> None:
+    told, gate = tmp_path / "told", tmp_path / "gate"
+    one = await start_one(hf.start(ToItself, str(told)), shutdown=8.0)
+    waiting = one.ask(Wait(str(gate)), timeout=30.0)
+    one.tell(OnesOwn(3))
+    await until_there(tmp_path / "gate.begun")
+    stopping = asyncio.create_task(system.stop(one, drain=True, deadline=30.0))
+    await asyncio.sleep(0)
+    gate.touch()
+    await stopping
+    assert await waiting == "waited"
+    assert sorted(told.read_text().split()) == ["0", "0", "0", "0", "1", "2", "3"]
+
+
 async def test_draining_ends_at_its_deadline(system: hf.ActorSystem, start_one: Starter) -> None:
     one = await start_one(hf.start(Account), shutdown=8.0)
     await system.suspend(one)
