@@ -476,6 +476,8 @@ class Draft:
             raise wrong(place.path, f"{why}: a restart of a supervisor of both would fail")
         for handing in self.arrangement.handings.values():
             handing.check()
+        for succession in self.arrangement.successions:
+            succession.check()
         for place in self.staying():
             if place.is_suspended and any(child.ends_or_begins_last for child in place.children.values()):
                 check_awake(place)

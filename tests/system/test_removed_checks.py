@@ -27,6 +27,8 @@ NAMED = "tests/control/test_named_children.py"
 FAR_NAMED = "tests/control/test_far_names.py"
 SLOW = "tests/supervision/test_slow_restarts.py"
 UPGRADE = "tests/system/upgrade/test_check_upgrade.py"
+DRY_RUNS = "tests/system/test_dry_runs.py"
+STOP = "tests/control/test_stop.py"
 COLLECTIONS = "tests/system/test_full_collections.py"
 CHANGES = "tests/effects/test_changes_of_races.py"
 ORDERS = "tests/effects/test_orders_while_resting.py"
@@ -1614,6 +1616,48 @@ CHECKS = {
         "True",
         "tests/system/test_two_systems.py",
         "test_a_ref_of_another_system",
+    ),
+    "who is given away is not changed by the same transaction": Check(
+        "system/transaction/draft.py",
+        "            handing.check()\n",
+        "            pass\n",
+        DRY_RUNS,
+        "test_what_a_dry_run_refuses and uvloop",
+    ),
+    "a supervisor whose place is taken is not suspended by the same transaction": Check(
+        "system/transaction/draft.py",
+        "            succession.check()\n",
+        "            pass\n",
+        DRY_RUNS,
+        "test_what_a_dry_run_refuses and uvloop",
+    ),
+    "a supervisor that will be suspended has nobody to stop behind the commit": Check(
+        "system/transaction/draft.py",
+        "return self.is_leaving or (self.is_switched and self.is_stopped) or self.comes_last",
+        "return self.is_leaving",
+        DRY_RUNS,
+        "test_what_a_dry_run_refuses and uvloop",
+    ),
+    "a supervisor in a process hears of a child as it has it": Check(
+        "system/transaction/arrangement.py",
+        "come[spec.id].spec_on_the_way(spec) if spec.id in come else spec",
+        "spec",
+        DRY_RUNS,
+        "test_what_a_dry_run_approves and strategy and uvloop",
+    ),
+    "what an actor tells itself while it is drained is let in": Check(
+        "actors/kernel/mailbox.py",
+        "if is_of_its_own(cell) and not isinstance(item, Ask):",
+        "if False:",
+        STOP,
+        "test_what_an_actor_tells_itself and task and not recorded",
+    ),
+    "and is waited for where it lives": Check(
+        "actors/control/drain.py",
+        "if not behind and cell",
+        "if cell",
+        STOP,
+        "test_what_an_actor_tells_itself and process and not recorded",
     ),
     "a connection is refused before a library is missed": Check(
         "cluster/servers.py",
