@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from ...supervision.spec import ChildSpec
     from ...supervision.supervisor import Supervisor
     from ..system import ActorSystem
+    from .succession import Succession
 
 
 UNKNOWN = (
@@ -101,12 +102,17 @@ class Handing:
         return above
 
     @property
+    def _is_early(self) -> bool:
+        """Whether its new supervisor is to be started by a step behind this one."""
+        return self._above.is_planned and self._above.cell is None
+
+    @property
     def waits_for(self) -> str:
         """Why it has no process of its own yet, in words; "" if nothing is known."""
         return self._lodging.waits_for
 
-    def check(self) -> None:
-        """Whether it can be given away with all else that the transaction wants of it.
+    def check(self, successions: list[Succession]) -> None:
+        """Whether it can be given away with all else that the transaction wants of it, and of whoever gets it.
 
         Raises:
             SpecError: why not.
@@ -119,6 +125,14 @@ class Handing:
                 "it goes to or from another process's supervisor: its state, code and mechanisms, and whether it is "
                 "suspended, are changed in a transaction of its own",
             )
+        comes_along = any(one.left is place.was.below for one in successions if one.place is place.parent)
+        if False and not comes_along:
+            for above in self._above.upwards():
+                if above.is_moved and above.was.start is not None:
+                    raise wrong(
+                        place.path,
+                        f"{above.path} begins anew there by this very transaction: move to it in the next one",
+                    )
 
     async def prepare(self, system: ActorSystem) -> None:
         """Have the new supervisor make room, if it lives in another process."""
@@ -131,6 +145,8 @@ class Handing:
             limits = place.spec.limits if place.spec is not None and place.spec.isolation == "process" else None
             work = functools.partial(system._moves.move, cell, "process", limits, within, known=place.spec)
             self._is_lodged |= await self._lodging.done(system, work)
+        if self._is_early:
+            return
         above = self._above.living(system._node)
         if not is_elsewhere(above) or (
             self._asked is above and self._life == above.coming_life and not self._has_failed()
@@ -160,6 +176,8 @@ class Handing:
         """What is in the way of giving it away at this instant; "" if nothing is."""
         if not self._place.is_given_away:
             return ""
+        if self._is_early:
+            return f"{self._above.path} is being started"
         cell = self._place.living(system._node)
         old, at = cell.host.parent, cell.host.place
         if not (self._place.is_protected or isinstance(at, WorkerPlace)):

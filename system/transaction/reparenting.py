@@ -263,7 +263,8 @@ class Regrouping(StagedWork):
 
         Who keeps its address goes on meanwhile: a turn of it, which may wait for days, is repeated where it began.
         """
-        for one in addressed(self._top) if self._is_readdressed(system) else ():
+        own = {self._top, *(place for place, _ in self._handings)}
+        for one in addressed_alone(self._top, own) if self._is_readdressed(system) else ():
             # Who is reworked rests for that, and is saved; replicas are only told.
             rests = not one.is_planned and (one.rework is None or one.is_protected)
             cell = one.now(system._node) if rests else None
@@ -383,6 +384,14 @@ def addressed(place: DraftPlace) -> Iterator[DraftPlace]:
     if not place.is_protected:
         for child in place.children.values():
             yield from addressed(child)
+
+
+def addressed_alone(place: DraftPlace, own: set[DraftPlace]) -> Iterator[DraftPlace]:
+    """The same, without those that another step moves there, `own` being those that this one does."""
+    if place in own or not place.has_moved:
+        yield place
+        for child in () if place.is_protected else place.children.values():
+            yield from addressed_alone(child, own)
 
 
 def check_movable(place: DraftPlace) -> None:

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from tests.system.trees import Add, Client, Double, Stumble, counter
+from tests.system.trees import Add, Client, Counter, Double, Stumble, counter
 
 Step = Callable[[hf.system.Change, dict[str, hf.ActorRef[Any]]], object]
 
@@ -76,6 +76,8 @@ SOME = [
 REFUSED = [
     ("move out", "state"),
     ("state far", "move in"),
+    ("move in", "move a supervisor out"),
+    ("move a supervisor in", "move out"),
     ("stop", "suspend above"),
     ("suspend above", "move a supervisor out"),
 ]
@@ -167,3 +169,19 @@ async def test_who_goes_to_another_supervisor_may_live_elsewhere_from_then_on(
             assert one.path == f"/app/{to}/{who}"
             assert (system.pid_of(one) == system.pid_of(at[to])) is (isolation == "task")
         one.kill()
+
+
+class Demanding(Counter):
+    def __init__(self, start: int, step: int) -> None:
+        super().__init__(start)
+        self.step = step
+
+
+async def test_code_that_does_not_take_the_arguments_is_refused_wherever_its_actor_lives(
+    system: hf.ActorSystem,
+) -> None:
+    at = await grow(system)
+    for who, dry_run in itertools.product(("x", "own", "y"), (True, False)):
+        with pytest.raises(hf.TransactionRefused, match="does not take the arguments of the old class"):
+            async with system.transaction(dry_run=dry_run) as change:
+                change.replace_code(at[who], Demanding)

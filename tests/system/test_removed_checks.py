@@ -1645,6 +1645,13 @@ CHECKS = {
         DRY_RUNS,
         "test_what_a_dry_run_approves and strategy and uvloop",
     ),
+    "code is asked beforehand whether it takes the arguments, also of an actor that lives elsewhere": Check(
+        "system/transaction/living.py",
+        "elif (spec := place.know_spec()) is not None:",
+        "elif (spec := place.know_spec()) is not None and False:",
+        DRY_RUNS,
+        "test_code_that_does_not_take and uvloop",
+    ),
     "what an actor tells itself while it is drained is let in": Check(
         "actors/kernel/mailbox.py",
         "if is_of_its_own(cell) and not isinstance(item, Ask):",
