@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from ...supervision.spec import ChildSpec
     from ...supervision.supervisor import Supervisor
     from ..system import ActorSystem
-    from .succession import Succession
 
 
 UNKNOWN = (
@@ -111,8 +110,8 @@ class Handing:
         """Why it has no process of its own yet, in words; "" if nothing is known."""
         return self._lodging.waits_for
 
-    def check(self, successions: list[Succession]) -> None:
-        """Whether it can be given away with all else that the transaction wants of it, and of whoever gets it.
+    def check(self) -> None:
+        """Whether it can be given away with all else that the transaction wants of it.
 
         Raises:
             SpecError: why not.
@@ -125,14 +124,6 @@ class Handing:
                 "it goes to or from another process's supervisor: its state, code and mechanisms, and whether it is "
                 "suspended, are changed in a transaction of its own",
             )
-        comes_along = any(one.left is place.was.below for one in successions if one.place is place.parent)
-        if False and not comes_along:
-            for above in self._above.upwards():
-                if above.is_moved and above.was.start is not None:
-                    raise wrong(
-                        place.path,
-                        f"{above.path} begins anew there by this very transaction: move to it in the next one",
-                    )
 
     async def prepare(self, system: ActorSystem) -> None:
         """Have the new supervisor make room, if it lives in another process."""

@@ -71,13 +71,13 @@ SOME = [
     ("move out", "process"),
     ("move a supervisor", "state"),
     ("move out", "strategy far"),
+    ("move in", "move a supervisor"),
+    ("move out", "move a supervisor in"),
 ]
 """Pairs that are approved."""
 REFUSED = [
     ("move out", "state"),
     ("state far", "move in"),
-    ("move in", "move a supervisor out"),
-    ("move a supervisor in", "move out"),
     ("stop", "suspend above"),
     ("suspend above", "move a supervisor out"),
 ]

@@ -1638,6 +1638,20 @@ CHECKS = {
         DRY_RUNS,
         "test_what_a_dry_run_refuses and uvloop",
     ),
+    "who is moved by another step is brought to rest by that step": Check(
+        "system/transaction/reparenting.py",
+        "if place in own or not place.has_moved:",
+        "if True:",
+        DRY_RUNS,
+        "test_what_a_dry_run_approves and supervisor and uvloop",
+    ),
+    "a child may be given to a supervisor that a later step starts": Check(
+        "system/transaction/handing.py",
+        "return self._above.is_planned and self._above.cell is None",
+        "return False",
+        DRY_RUNS,
+        "test_what_a_dry_run_approves and out and uvloop",
+    ),
     "a supervisor in a process hears of a child as it has it": Check(
         "system/transaction/arrangement.py",
         "come[spec.id].spec_on_the_way(spec) if spec.id in come else spec",
