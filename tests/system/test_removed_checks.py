@@ -293,8 +293,8 @@ CHECKS = {
     ),
     "who keeps its address need not come to rest": Check(
         "system/transaction/reparenting.py",
-        "addressed(self._top) if self._is_readdressed(system) else ():",
-        "addressed(self._top):",
+        "addressed_alone(self._top, own) if self._is_readdressed(system) else ():",
+        "addressed_alone(self._top, own):",
         RESTING,
         "a_supervisor_is_given_a_process and list",
     ),
@@ -783,8 +783,8 @@ CHECKS = {
     ),
     "who was lodged in a process lives where it did if the move is given up": Check(
         "system/transaction/handing.py",
-        "        if self._is_lodged and cell is not None:\n",
-        "        if False:\n",
+        "                if self._is_lodged:\n",
+        "                if False:\n",
         FAR,
         "test_a_move_that_is_given_up",
     ),
@@ -1521,8 +1521,8 @@ CHECKS = {
     ),
     "the flags of a transaction leave the template in a process": Check(
         "system/transaction/arrangement.py",
-        "children = None if place.is_dynamic else list(",
-        "children = list(",
+        "children = None if place.is_dynamic else specs",
+        "children = specs",
         CHANGED,
         "leaves_the_template and process",
     ),
