@@ -1,7 +1,8 @@
 """How long does a live actor stand still when it is moved between a task and a process, and is anything lost?
 
 Several senders tell and ask without a break, each numbering its messages, while the actor is moved to and fro; in the
-end it says what it has got from whom.
+end it says what it has got from whom. `large`: how long the root's loop stands still while a large state changes its
+place, for all others in the root.
 Baseline: none; the figures are absolute.
 Command: python benchmarks/bench_move.py [--quick]
 """
@@ -9,8 +10,10 @@ Command: python benchmarks/bench_move.py [--quick]
 from __future__ import annotations
 
 import asyncio
+import tempfile
 from typing import Any
 
+import numpy as np
 from harness import Run, main
 
 import holdfast as hf
@@ -62,6 +65,13 @@ class Ledger(hf.Actor):
     @hf.on(Sums)
     def sums(self, message: Sums) -> list[list[int]]:
         return [list(one) for one in zip(self.last, self.count, self.wrong, strict=True)]
+
+
+class Grid(hf.Actor):
+    """A map of so many megabytes."""
+
+    def __init__(self, megabytes: int) -> None:
+        self.cells = np.arange(megabytes * 250_000, dtype=np.float32)
 
 
 class Senders:
@@ -133,5 +143,52 @@ async def recorded(run: Run) -> None:
     await _moves(run, "recorded actor", hf.hybrid())
 
 
+async def large(run: Run) -> None:
+    """How long the root's loop runs nobody else while an actor with a large state changes its place."""
+    for megabytes in (1, 5, 20, 80):
+        for name in ("plain", "recorded", "stored"):
+            gaps: dict[str, list[float]] = {}
+            for _ in range(run.n):
+                with tempfile.TemporaryDirectory() as folder:
+                    store = f"sqlite:{folder}/bench.db" if name == "stored" else None
+                    await _gaps(megabytes, None if name == "plain" else hf.hybrid(), store, gaps)
+            for way, found in gaps.items():
+                job = f"{name} actor of {megabytes} MB, {way}: longest gap of the root's loop, median of {len(found)}"
+                run.bound(job, sorted(found)[len(found) // 2] * 1e3, unit="ms", target=20.0 + 30.0 * megabytes)
+
+
+async def _gaps(megabytes: int, recovery: Any, store: str | None, gaps: dict[str, list[float]]) -> None:
+    async with hf.ActorSystem("bench", store=store, log=False) as system:
+        ref = await system.start(hf.child("grid", hf.start(Grid, megabytes), recovery=recovery))
+        await system.start(hf.supervisor("far", isolation="process", children=[]))
+        ways: dict[str, tuple[Any, ...]] = {
+            "from a task to a process": ("isolation", "process"),
+            "from a process to a task": ("isolation", "task"),
+            "to a supervisor in a process": ("move", "/bench/far"),
+            "back from there": ("move", "/bench"),
+        }
+        for way, (step, to) in ways.items():
+            await asyncio.sleep(0.2)
+            ticker = asyncio.create_task(_longest_gap())
+            await asyncio.sleep(0.05)
+            async with system.transaction(timeout=60.0) as change:
+                getattr(change, step)(ref, to)
+            await asyncio.sleep(0.05)
+            ticker.cancel()
+            gaps.setdefault(way, []).append(await ticker)
+
+
+async def _longest_gap() -> float:
+    """Until it is cancelled: the longest time beyond a millisecond between two ticks."""
+    loop, longest = asyncio.get_running_loop(), 0.0
+    try:
+        while True:
+            before = loop.time()
+            await asyncio.sleep(0.001)
+            longest = max(longest, loop.time() - before - 0.001)
+    except asyncio.CancelledError:
+        return longest
+
+
 if __name__ == "__main__":
-    main([plain, recorded])
+    main([plain, recorded, large])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from pathlib import Path
 from typing import Annotated
+from urllib.parse import urlencode
 
 import msgspec
 import typer
@@ -12,7 +13,7 @@ import typer
 from ..actors.errors import HoldfastError, SpecError
 from ..cluster.configuration import read_configuration
 from ..cluster.nats.server_check import check_store
-from ..cluster.nats.server_file import ServerPlan, TlsFiles, write_server_files
+from ..cluster.nats.server_file import ServerPlan, TlsFiles, host_and_port, write_server_files
 from .operate.reaching import FAILED, UNUSABLE, Json, printable, show_json
 
 nats = typer.Typer(
@@ -41,7 +42,8 @@ def config(
 ) -> None:
     """Write the configuration of one NATS server, or of each of three, and a key for each role in each system.
 
-    Servers on other hosts than 127.0.0.1 need --certificate, --key and --ca.
+    Servers on other hosts than 127.0.0.1 need --certificate, --key and --ca. The address that a program gives as its
+    store stands behind the files.
 
     Exit status 0: the files are there. 2: they could not be written.
     """
@@ -53,6 +55,8 @@ def config(
         raise _ended("config", error) from error
     for file in files:
         typer.echo(printable(str(file)))
+    for one in system:
+        typer.echo(printable(f'{one}: store="{store_address(plans, one, folder.resolve() / f"{one}-node.nk")}"'))
 
 
 @nats.command()
@@ -124,6 +128,15 @@ def _tls(certificate: str | None, key: str | None, ca: str | None) -> TlsFiles |
             return TlsFiles(certificate, key, ca)
         case _:
             raise SpecError("nats config", "--certificate, --key and --ca belong together: give all or none")
+
+
+def store_address(plans: list[ServerPlan], system: str, nkey: Path) -> str:
+    """The address that a program of a system gives as its store; with TLS it has a certificate of its own to name."""
+    told, tls = {"nkey": str(nkey)}, plans[0].tls
+    if tls is not None:
+        told |= {"ca": tls.ca, "certificate": "FILE", "key": "FILE"}
+    servers = ",".join(host_and_port(plan.host, plan.port) for plan in plans)
+    return f"{'nats' if tls is None else 'tls'}://{servers}/{system}?{urlencode(told, safe='/')}"
 
 
 def _plans(hosts: list[str], ports: tuple[int, int, int], store_dir: str, tls: TlsFiles | None) -> list[ServerPlan]:

@@ -54,7 +54,7 @@ from ..supervision.spec import ChildSpec, Isolation
 from ..supervision.supervisor import Supervisor
 from .history.authors import author
 from .history.recorder import HistoryRecorder, expect_end
-from .live_moves import Moves, check_isolation
+from .live_moves import BETWEEN_TURNS, Moves, check_isolation, why_not_left
 from .transaction.errors import TransactionFailed
 from .transaction.mechanisms import Isolate
 
@@ -185,12 +185,17 @@ class Controls:
                 cell.more.tap.attach()
             respec(cell, start)
 
-    async def _turn_in_hand(self, target: Target) -> str:
-        """The turn that an actor is in, for how long it has been, and where it waits, in words; "" if none is known."""
+    async def _turn_in_hand(self, target: Target, *, is_left: bool = False) -> str:
+        """The turn that an actor is in, for how long it has been, and where it waits, in words; "" if none is known.
+
+        With `is_left` it is told, too, why a turn that waits was not left, and what helps.
+        """
         try:
-            return said_of_turn(await self.get_status(target, timeout=STATUS_WITHIN))
+            said = said_of_turn(await self.get_status(target, timeout=STATUS_WITHIN))
+            why = why_not_left(self._living(target)) if said and is_left else ""
         except HoldfastError:
             return ""
+        return "; ".join(filter(None, (said, why)))
 
     async def get_status(self, target: Target, *, timeout: float = DEFAULT_TIMEOUT) -> Status:
         """How an actor is, also while a turn of it waits for something, and between two lives."""
@@ -397,11 +402,12 @@ class Controls:
         try:
             return await self._moves.given(cell, wanted, timeout)
         except AskTimeout as late:
-            raise await self._busy(cell, late) from late
+            raise await self._busy(cell, late, is_left=isinstance(wanted, BETWEEN_TURNS)) from late
 
-    async def _busy(self, cell: Cell, late: AskTimeout) -> AskTimeout:
+    async def _busy(self, cell: Cell, late: AskTimeout, *, is_left: bool = False) -> AskTimeout:
         """The same error; it says which turn is in the way, and since when, if that is known."""
-        return type(late)(late.actor, late.seconds, late.handled, late.why, await self._turn_in_hand(cell.ref))
+        turn = await self._turn_in_hand(cell.ref, is_left=is_left)
+        return type(late)(late.actor, late.seconds, late.handled, late.why, turn)
 
 
 def said_of_turn(status: Status) -> str:

@@ -29,6 +29,7 @@ from ..checkpoint.home.recorded_home import switch_of
 from ..checkpoint.places.far_parent import FarParent
 from ..checkpoint.places.life_here import LifeHere
 from ..checkpoint.places.recorded_moves import ToRecordedHere, ToRecordedWorker, leaving
+from ..checkpoint.places.subtree_place import SubtreePlace
 from ..supervision.respec import NO_RECIPE, recipe_spec, replace_mechanism, replace_place
 from ..supervision.spec import ChildSpec, Isolation
 from ..supervision.supervisor import Supervisor
@@ -484,6 +485,22 @@ def rests(cell: Cell) -> bool:
         return False
     is_here = isinstance(host.place, (LifeHere, WorkerPlace)) and not isinstance(host.parent, FarParent)
     return is_here and switch.calls.rests.is_busy
+
+
+def why_not_left(cell: Cell) -> str:
+    """Why an order waits for the turn of an actor that rests, and what helps, in words; "" if it does not."""
+    switch, above = switch_of(cell), cell.host.parent
+    if switch is None or not isinstance(above, FarParent) or not switch.calls.rests.is_busy:
+        return ""
+    team: Cell | None = cell.parent
+    while team is not None and not isinstance(team.host.place, SubtreePlace):
+        team = team.parent
+    if team is None:
+        return ""
+    return (
+        f"{team.path} has a process, below which a turn that waits is not left: have it live as a task, repeat this, "
+        "and have it live in a process again"
+    )
 
 
 def ended_too_often(lives: int) -> str:

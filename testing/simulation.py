@@ -325,10 +325,14 @@ class Simulation:
         """
         node = ref._cell.node
         systems = [*(() if self._fleet is None else self._fleet.systems), *(root.system for root in self._roots[-1:])]
-        found = next((system for system in systems if system._running is node), None)
-        worker = None if found is None else found._workers.of(ref._cell)
+        pools = [system._workers for system in systems if system._running is node]
+        worker = pools[0].of(ref._cell) if pools else None
         if worker is None:
-            raise SpecError(ref.path, "it has no process of its own")
+            above = ref._cell.parent
+            while above is not None and not any(pool.of(above) for pool in pools):
+                above = above.parent
+            instead = "" if above is None else f": kill that of {above.path}, in which it lives"
+            raise SpecError(ref.path, f"it has no process of its own{instead}")
         worker.forked.kill()
 
     @property

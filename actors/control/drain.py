@@ -12,7 +12,8 @@ from .orders_lane import order
 async def drain(cell: Cell, seconds: float) -> bool:
     """Have what is queued handled, and let nothing new in: asks fail with ActorStopped, tells are dead letters.
 
-    It goes on over restarts. A suspended actor handles nothing, so there only the time passes.
+    What the actor tells itself meanwhile is handled, too. It goes on over restarts. A suspended actor handles nothing,
+    so there only the time passes.
 
     Returns:
         Whether all was handled within `seconds`. If so or not: nothing is let in from now on.
@@ -27,12 +28,12 @@ async def drain(cell: Cell, seconds: float) -> bool:
             if left <= 0:
                 return False
             try:
-                await order(cell, Mark(), left)
+                behind = await order(cell, Mark(), left)
             except AskFailed:  # Its process has ended: what it had not begun is handled by the next life.
                 continue
             except AskTimeout:
                 return False
-            if cell.host.backlog(cell) == 0:
+            if not behind and cell.host.backlog(cell) == 0:
                 return True
     except ActorStopped:
         pass

@@ -196,13 +196,18 @@ def next_start(cell: Cell, new: Start[Any], *, keeps_arguments: bool) -> Start[A
     spec: Any = cell.spec
     if not dataclasses.is_dataclass(spec) or isinstance(spec, type):
         return start  # It is never started again, or by a supervisor in another process: there this is asked again.
+    check_start(cell.path, spec, start)
+    return start
+
+
+def check_start(path: str, spec: Any, start: Start[Any]) -> None:
+    """Whether a child of this spec can begin so. Raises SpecError: its class does not take the arguments."""
     try:
         start.check()
     except TypeError as error:
         problem = f"{type_name(start.kind)} does not take the arguments of the old class ({error})"
-        raise SpecError(cell.path, f"{problem}; give start({start.kind.__name__}, ...)") from error
+        raise SpecError(path, f"{problem}; give start({start.kind.__name__}, ...)") from error
     dataclasses.replace(spec, start=start)  # Raises what the spec does not allow.
-    return start
 
 
 # -- what a transaction orders: it is prepared beside what runs, and then put in force at once ------------------------
@@ -390,12 +395,12 @@ class ObserveTurns(Order):
 
 
 class Mark(Order):
-    """Do nothing: its turn says that everything before it has been handled."""
+    """Do nothing: its turn says that everything before it has been handled, and how many messages stand behind it."""
 
     verb = "mark"
 
-    def run(self, cell: Cell, actor: Actor) -> None:
-        return None
+    def run(self, cell: Cell, actor: Actor) -> int:
+        return sum(map(mailbox.counts, cell.queue or ()))
 
 
 class Ready(Order):

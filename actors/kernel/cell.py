@@ -527,7 +527,7 @@ class Cell(_Hot):
         more = self.more
         if more is None:
             return None
-        if self.admit is mailbox.admit_closing:
+        if self.admit is mailbox.admit_closing and not mailbox.is_of_its_own(self):
             raise ActorStopped(self.path, "it is stopping")
         if more.outlet is not None and (wait := more.outlet.room()) is not None:
             return wait  # type: ignore[no-any-return]

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from ..errors import MailboxFull
 from ..overflow import Overflow, check, decide, drop_reason
 from .envelope import LEAVE, Ask, Envelope, Item, message_in
+from .ref import current
 
 if TYPE_CHECKING:
     from .cell import Cell
@@ -52,12 +53,24 @@ def admit_bounded(cell: Cell, item: Any) -> None:
 
 
 def admit_closing(cell: Cell, item: Any) -> None:
-    """The actor handles what is queued and then stops: nothing new is let in. (`Cell.room` refuses a `send`.)"""
-    if isinstance(item, Ask):
+    """The actor handles what is queued and then stops: nothing new is let in. (`Cell.room` refuses a `send`.)
+
+    What it tells itself belongs to what is queued.
+    """
+    if is_of_its_own(cell) and not isinstance(item, Ask):
+        admit = admit_first if cell.extra().bound is None else admit_bounded
+        admit(cell, item)
+    elif isinstance(item, Ask):
         item.fail(cell.stopped_error("it is stopping"))
     else:
         sender = item.sender if isinstance(item, Envelope) else None
         cell.node.dead_letter(cell, message_in(item), "the actor is stopping", sender)
+
+
+def is_of_its_own(cell: Cell) -> bool:
+    """Whether it is the actor of this cell itself that sends, in a turn or a task of its own."""
+    sender = current.get(None)
+    return sender is not None and sender._cell is cell
 
 
 def admit_gone(cell: Cell, item: Any) -> None:

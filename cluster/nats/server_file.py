@@ -162,7 +162,7 @@ def server_text(server: ServerPlan, cluster: Sequence[ServerPlan], accounts: Seq
     _check(cluster, accounts)
     lines = [
         f"server_name: {_quoted(server.name)}",
-        f"listen: {_quoted(_address(server.host, server.port))}",
+        f"listen: {_quoted(host_and_port(server.host, server.port))}",
         *([f'http: "127.0.0.1:{server.monitor_port}"'] if server.monitor_port else []),
         f"max_payload: {MOST_BYTES}",
         f"max_pending: {8 * MOST_BYTES}",
@@ -178,11 +178,12 @@ def server_text(server: ServerPlan, cluster: Sequence[ServerPlan], accounts: Seq
     ]
     if len(cluster) > 1:
         known = f"holdfast:{secret}@"
-        routes = [f"nats-route://{known}{_address(one.host, one.cluster_port)}" for one in cluster if one != server]
+        others = [host_and_port(one.host, one.cluster_port) for one in cluster if one != server]
+        routes = [f"nats-route://{known}{other}" for other in others]
         lines += [
             "cluster {",
             '  name: "holdfast"',
-            f"  listen: {_quoted(_address(server.host, server.cluster_port))}",
+            f"  listen: {_quoted(host_and_port(server.host, server.cluster_port))}",
             f"  authorization {{ user: holdfast, password: {_quoted(secret)} }}",
             f"  routes: {_listed(routes)}",
             *_tls(server, "  "),
@@ -357,9 +358,9 @@ def _identity(server: ServerPlan, text: str) -> str:
         case "name":
             return server.name
         case "client address":
-            return _address(server.host, server.port)
+            return host_and_port(server.host, server.port)
         case _:
-            return _address(server.host, server.cluster_port)
+            return host_and_port(server.host, server.cluster_port)
 
 
 def _account(account: NatsAccount) -> list[str]:
@@ -388,7 +389,7 @@ def _tls(server: ServerPlan, indent: str) -> list[str]:
     ]
 
 
-def _address(host: str, port: int) -> str:
+def host_and_port(host: str, port: int) -> str:
     return f"[{host}]:{port}" if ":" in host and not host.startswith("[") else f"{host}:{port}"
 
 

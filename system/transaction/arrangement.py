@@ -189,7 +189,16 @@ class Arrangement:
             cell = place.living(system._node) if not place.is_planned else None
             if cell is not None and is_elsewhere(cell):
                 ref: ActorRef[Supervisor] = ActorRef(cell)
-                children = None if place.is_dynamic else list(recipe_specs(cell) or ())
+                come = {
+                    one.name: self.handings[one]
+                    for one in place.children.values()
+                    if one in self.handings and one.is_given_away
+                }
+                specs = [
+                    come[spec.id].spec_on_the_way(spec) if spec.id in come else spec
+                    for spec in recipe_specs(cell) or ()
+                ]
+                children = None if place.is_dynamic else specs
                 await ref.ask(ChangeSupervisor(flags=recipe_flags(cell), children=children), START_TIMEOUT)
 
 

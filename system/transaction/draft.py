@@ -113,6 +113,22 @@ class DraftPlace:
         return not self.is_planned and self.parent is not self.was.below
 
     @property
+    def is_given_away(self) -> bool:
+        """Whether one supervisor gives it to another, and one of them lives in another process, or will."""
+        old, new = self.was.below, self.parent
+        return self.has_moved and old is not None and new is not None and (old.is_far or new.is_far)
+
+    @property
+    def is_far(self) -> bool:
+        """Whether a supervisor lives, or will live, in another process."""
+        for one in self.upwards():
+            if not one.is_planned:
+                return one.cell is not None and is_elsewhere(one.cell)
+            if one.spec is not None and one.spec.isolation == "process":
+                return True
+        return False
+
+    @property
     def is_moved_to(self) -> bool:
         """Whether somebody else's child comes here."""
         return any(child.has_moved for child in self.children.values())
@@ -136,6 +152,11 @@ class DraftPlace:
                 to for port, to in place.bindings.items() if place.spec is not None and port in place.spec.bindings
             ]
         return False
+
+    @property
+    def ends_or_begins_last(self) -> bool:
+        """Whether its supervisor has to stop or start it when all is in force."""
+        return self.is_leaving or (self.is_switched and self.is_stopped) or self.comes_last
 
     @property
     def is_supervisor(self) -> bool:
@@ -447,14 +468,18 @@ class Draft:
         """What must hold when all is done.
 
         Raises:
-            SpecError: a binding would point at nobody, also when a supervisor is restarted, or a suspended supervisor
-                would have to stop a child.
+            SpecError: a binding would point at nobody, also when a supervisor is restarted; a suspended supervisor
+                would have to stop or start a child; or an actor that is given away is changed as well.
         """
         for place, port in self._started_too_early() - self._early:
             why = f"it is started before the one to which its spec binds {port!r}"
             raise wrong(place.path, f"{why}: a restart of a supervisor of both would fail")
+        for handing in self.arrangement.handings.values():
+            handing.check()
+        for succession in self.arrangement.successions:
+            succession.check()
         for place in self.staying():
-            if place.is_suspended and any(child.is_leaving for child in place.children.values()):
+            if place.is_suspended and any(child.ends_or_begins_last for child in place.children.values()):
                 check_awake(place)
             for port, target in place.bindings.items():
                 if any(above.is_leaving for above in target.upwards()):

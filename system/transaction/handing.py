@@ -43,16 +43,6 @@ UNKNOWN = (
 """Why a child cannot be given away."""
 
 
-def is_far(supervisor: DraftPlace) -> bool:
-    """Whether a supervisor lives, or will live, in another process."""
-    for one in supervisor.upwards():
-        if not one.is_planned:
-            return one.cell is not None and is_elsewhere(one.cell)
-        if one.spec is not None and one.spec.isolation == "process":
-            return True
-    return False
-
-
 def check_handing(place: DraftPlace, old: DraftPlace, new: DraftPlace) -> None:
     """Whether a child can be given by one supervisor to another, one of which lives in another process.
 
@@ -62,7 +52,7 @@ def check_handing(place: DraftPlace, old: DraftPlace, new: DraftPlace) -> None:
     check_handed(place, old, new)
     if place.cell is None or place.is_stopped:
         raise wrong(place.path, "it does not run, and a supervisor lives in another process: start it first")
-    if is_far(new):
+    if new.is_far:
         for one in (recipe_specs(new.cell) or ()) if new.cell is not None else ():
             early = one.bindings.keys() - one.late
             if port := next((port for port in early if is_at(place, one.bindings[port])), ""):
@@ -86,7 +76,7 @@ def check_handed(place: DraftPlace, old: DraftPlace, new: DraftPlace) -> None:
     spec = place.spec
     if spec is None:
         raise wrong(place.path, UNKNOWN)
-    if is_far(new):
+    if new.is_far:
         check_subtree(new.path, (spec,))
         Boxed(spec).packed()
 
@@ -111,28 +101,43 @@ class Handing:
         return above
 
     @property
+    def _is_early(self) -> bool:
+        """Whether its new supervisor is to be started by a step behind this one."""
+        return self._above.is_planned and self._above.cell is None
+
+    @property
     def waits_for(self) -> str:
         """Why it has no process of its own yet, in words; "" if nothing is known."""
         return self._lodging.waits_for
 
-    @property
-    def _is_needed(self) -> bool:
-        old = self._place.was.below
-        assert old is not None
-        return is_far(old) or is_far(self._above)
+    def check(self) -> None:
+        """Whether it can be given away with all else that the transaction wants of it.
+
+        Raises:
+            SpecError: why not.
+        """
+        place, moves = self._place, self._place.relocation
+        is_changed = place.rework is not None or (moves is not None and not moves.is_of_place_alone)
+        if place.is_given_away and is_changed:
+            raise wrong(
+                place.path,
+                "it goes to or from another process's supervisor: its state, code and mechanisms, and whether it is "
+                "suspended, are changed in a transaction of its own",
+            )
 
     async def prepare(self, system: ActorSystem) -> None:
         """Have the new supervisor make room, if it lives in another process."""
         place = self._place
-        if not self._is_needed:
+        if not place.is_given_away:
             return
-        if place.rework is not None or place.relocation is not None:
-            raise wrong(place.path, "it goes to another process's supervisor: change it in a transaction of its own")
         cell = place.living(system._node)
         if not place.is_protected and place_of(cell) != "process":
             within = max(MOVED_WITHIN, self._timeout)
-            work = functools.partial(system._moves.move, cell, "process", None, within, known=place.spec)
+            limits = place.spec.limits if place.spec is not None and place.spec.isolation == "process" else None
+            work = functools.partial(system._moves.move, cell, "process", limits, within, known=place.spec)
             self._is_lodged |= await self._lodging.done(system, work)
+        if self._is_early:
+            return
         above = self._above.living(system._node)
         if not is_elsewhere(above) or (
             self._asked is above and self._life == above.coming_life and not self._has_failed()
@@ -143,9 +148,7 @@ class Handing:
         self._parent = far_parent(above, place.path)
         self._parent.expect()
         supervisor: ActorRef[Supervisor] = ActorRef(above)
-        spec = planned_spec(place, in_force=True)
-        if not place.is_protected:
-            spec = dataclasses.replace(spec, isolation="process")
+        spec = self.spec_on_the_way(planned_spec(place, in_force=True))
         asked = supervisor.ask(StartChild(spec, candidate=self._candidate), START_TIMEOUT)
         self._start = system._node.loop.create_task(_reply(asked), name=f"room for {place.path}")
         self._start.add_done_callback(seen)
@@ -162,8 +165,10 @@ class Handing:
 
     def ready(self, system: ActorSystem) -> str:
         """What is in the way of giving it away at this instant; "" if nothing is."""
-        if not self._is_needed:
+        if not self._place.is_given_away:
             return ""
+        if self._is_early:
+            return f"{self._above.path} is being started"
         cell = self._place.living(system._node)
         old, at = cell.host.parent, cell.host.place
         if not (self._place.is_protected or isinstance(at, WorkerPlace)):
@@ -182,7 +187,7 @@ class Handing:
 
     def commit(self, cell: Cell) -> None:
         """From here on the other supervisor decides what follows from its ends."""
-        if not self._is_needed:
+        if not self._place.is_given_away:
             return
         old, new = cell.host.parent, self._parent
         if isinstance(old, FarParent):
@@ -191,21 +196,28 @@ class Handing:
             new.take(cell)
 
     def spec(self, spec: ChildSpec) -> ChildSpec:
-        """Its spec from the commit on: as it was before it had a process for this."""
+        """Its spec from the commit on: as the transaction has it, and not as it had a process for this."""
         known = self._place.spec
         assert known is not None
-        return dataclasses.replace(spec, isolation=known.isolation, limits=known.limits) if self._is_lodged else spec
+        is_other = self._is_lodged or self._place.relocation is not None
+        return dataclasses.replace(spec, isolation=known.isolation, limits=known.limits) if is_other else spec
+
+    def spec_on_the_way(self, spec: ChildSpec) -> ChildSpec:
+        """Its spec as a supervisor in another process has it until it lives where that says."""
+        return spec if self._place.is_protected else dataclasses.replace(spec, isolation="process")
 
     async def finish(self, system: ActorSystem) -> None:
         """Have it live where its spec says, when the new supervisor knows of it."""
         if self._start is not None:
             with contextlib.suppress(HoldfastError):  # It has ended: the next life has it in its recipe.
                 await asyncio.shield(self._start)
-        await self._settle(system)
+        spec, moves = self._place.spec, self._place.relocation
+        if spec is not None and spec.isolation == "task" and (self._is_lodged or moves is not None):
+            await self._settle(system)
 
     async def _settle(self, system: ActorSystem) -> None:
         cell = self._place.now(system._node)
-        if self._is_lodged and cell is not None:
+        if cell is not None:
             await system._moves.move(cell, "task", None, self._timeout)
 
     async def release(self, system: ActorSystem) -> None:
@@ -216,7 +228,8 @@ class Handing:
             try:
                 await self._withdraw()
             finally:
-                await self._settle(system)
+                if self._is_lodged:
+                    await self._settle(system)
 
     async def _withdraw(self) -> None:
         start, parent, asked = self._start, self._parent, self._asked

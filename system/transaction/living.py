@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from ...actors.control.orders import Change, ReplaceCode, ReplaceState, next_start
+from ...actors.control.orders import Change, ReplaceCode, ReplaceState, check_start, next_start
 from ...actors.errors import ActorStopped, NameTaken, NoSuchActor, SpecError, type_name
 from ...actors.kernel.actor import Actor, Start
 from ...actors.kernel.cell import RUNNING
 from ...actors.kernel.ref import Target
 from ...actors.values.path_parts import check_beside
 from ...supervision.respec import rebind
+from ...supervision.spec import ChildSpec
 from .draft import Draft, DraftPlace, is_elsewhere
 from .operation import PROTECTED, Operation, StagedWork, text_of, wrong
 from .rework import Rework
@@ -136,8 +137,11 @@ class ReplaceActorCode(OnRework):
             raise SpecError(self.target, f"replace_code takes an Actor class or start(Class, ...), not {new!r}")
         place = self._place
         cell, keeps = place.cell, not isinstance(new, Start)
-        if cell is not None and not is_elsewhere(cell):
+        if cell is not None and isinstance(cell.spec, ChildSpec) and not is_elsewhere(cell):
             next_start(cell, start, keeps_arguments=keeps)
+        elif (spec := place.know_spec()) is not None:
+            old = spec.start
+            check_start(place.path, spec, Start(start.kind, old.args, old.kwargs) if keeps else start)
         place.rework_of().add(ReplaceCode(start, keeps, self._change))
         place.kind = start.kind
 

@@ -15,7 +15,6 @@ from ...supervision.respec import NO_RECIPE, recipe_spec
 from ...supervision.spec import Isolation
 from ...supervision.supervisor_changes import check_subtree
 from .draft import Draft, DraftPlace, is_elsewhere, rules
-from .handing import is_far
 from .living import OnSharedWork
 from .operation import Operation, wrong
 from .relocation import Relocation, described
@@ -79,7 +78,7 @@ class Isolate(OnPlace):
         assert above is not None
         assert place.spec is not None
         place.relocation = self._work = None
-        if is_far(above):
+        if above.is_far:
             raise wrong(self.target, "its supervisor lives in another process: it lives there, as a task")
         limits = self._limits or place.spec.limits
         spec = dataclasses.replace(place.spec, isolation=self._to, limits=limits if self._to == "process" else None)

@@ -152,6 +152,16 @@ class Relocation(StagedWork):
         return self._is_elsewhere and self._after.mechanism is None
 
     @property
+    def is_of_place_alone(self) -> bool:
+        """Whether it is about where an actor lives that nobody protects, before or after."""
+        return self.before.mechanism is None and self._after.mechanism is None
+
+    @property
+    def _is_by_others(self) -> bool:
+        """Whether others carry it out: who starts it, or who gives it to its new supervisor."""
+        return self._place.is_planned or self._place.is_given_away
+
+    @property
     def _comes_last(self) -> bool:
         """Its state, its code or its address is changed too: it is where it is until that is done."""
         at: DraftPlace | None = self._place
@@ -163,7 +173,7 @@ class Relocation(StagedWork):
 
     async def prepare(self, system: ActorSystem) -> None:
         """Make the new place ready and wait until the life is at rest."""
-        if self._place.is_planned or not (self._adapts or self._moves):
+        if self._is_by_others or not (self._adapts or self._moves):
             return
         if self._adapts and self._grant is None:
             path = self._place.path
@@ -201,7 +211,7 @@ class Relocation(StagedWork):
 
     def commit(self, system: ActorSystem) -> None:
         """From here on its spec says so."""
-        if self._place.is_planned or not (self._adapts or self._is_elsewhere):
+        if self._is_by_others or not (self._adapts or self._is_elsewhere):
             return
         cell = self._place.living(system._node)
         now = cell.spec if isinstance(cell.spec, ChildSpec) else recipe_spec(cell)
@@ -218,7 +228,7 @@ class Relocation(StagedWork):
 
     async def finish(self, system: ActorSystem) -> None:
         """Have its life follow."""
-        if self._place.is_planned or not (self._adapts or self._moves):
+        if self._is_by_others or not (self._adapts or self._moves):
             return
         try:
             if self._move.task is None:

@@ -20,7 +20,7 @@ from ...checkpoint.home.recorded_home import said_of_turn, switch_of
 from ...supervision.children import STOPPED, UP
 from .arrangement import busy, child_of
 from .draft import Draft, DraftPlace, is_elsewhere
-from .handing import UNKNOWN, Handing, check_handed, check_handing, is_far
+from .handing import UNKNOWN, Handing, check_handed, check_handing
 from .living import OnSharedWork
 from .operation import Operation, StagedWork, text_of, wrong
 from .relocation import MOVED_WITHIN, Gated, Inhabited
@@ -56,10 +56,10 @@ class Reparent(OnSharedWork):
         place = draft.find(self._at)
         new, old = await draft.supervisor(self._to), place.parent
         self.target = place.path
-        if old is not None and old.is_supervisor and is_far(old):
+        if old is not None and old.is_supervisor and old.is_far:
             await draft.supervisor(old.path)  # It tells whom it has.
         place.know_spec()
-        if place.spec is None and old is not None and old.is_supervisor and is_far(old):
+        if place.spec is None and old is not None and old.is_supervisor and old.is_far:
             raise wrong(place.path, UNKNOWN)
         if old is None or not old.is_supervisor or place.spec is None:
             raise wrong(place.path, "no supervisor looks after it, so it cannot be moved to another")
@@ -68,7 +68,7 @@ class Reparent(OnSharedWork):
         check_not_uniform(old)
         if any(one.place is place for one in draft.arrangement.successions):
             raise wrong(place.path, "it begins anew there by this very transaction: move it once")
-        if is_far(old) or is_far(new):
+        if old.is_far or new.is_far:
             check_handing(place, old, new)
         for above in new.upwards():
             if above.comes_last:
@@ -82,7 +82,7 @@ class Reparent(OnSharedWork):
             if place.name in new.was.children:
                 why = f"it has a child {place.name!r} until this transaction is in force: use the next one"
                 raise wrong(new.path, why)
-            anew = await successors(draft, place, new, is_given=is_far(old) or is_far(new))
+            anew = await successors(draft, place, new, is_given=old.is_far or new.is_far)
         for one in addressed(place):
             check_movable(one)
         check_child(new, place.spec)
@@ -263,7 +263,8 @@ class Regrouping(StagedWork):
 
         Who keeps its address goes on meanwhile: a turn of it, which may wait for days, is repeated where it began.
         """
-        for one in addressed(self._top) if self._is_readdressed(system) else ():
+        own = {self._top, *(place for place, _ in self._handings)}
+        for one in addressed_alone(self._top, own) if self._is_readdressed(system) else ():
             # Who is reworked rests for that, and is saved; replicas are only told.
             rests = not one.is_planned and (one.rework is None or one.is_protected)
             cell = one.now(system._node) if rests else None
@@ -385,6 +386,14 @@ def addressed(place: DraftPlace) -> Iterator[DraftPlace]:
             yield from addressed(child)
 
 
+def addressed_alone(place: DraftPlace, own: set[DraftPlace]) -> Iterator[DraftPlace]:
+    """The same, without those that another step moves there, `own` being those that this one does."""
+    if place in own or not place.has_moved:
+        yield place
+        for child in () if place.is_protected else place.children.values():
+            yield from addressed_alone(child, own)
+
+
 def check_movable(place: DraftPlace) -> None:
     """Whether an actor can have another address.
 
@@ -401,7 +410,7 @@ def begins_anew(place: DraftPlace, old: DraftPlace, new: DraftPlace) -> bool:
     """Whether another supervisor takes the place of this one, for some of it is in another process, or will be."""
     if not place.is_supervisor or place.is_planned:
         return False
-    return is_far(old) or is_far(new) or any(one.is_supervisor and has_process(one) for one in addressed(place))
+    return old.is_far or new.is_far or any(one.is_supervisor and has_process(one) for one in addressed(place))
 
 
 def has_process(place: DraftPlace) -> bool:
@@ -428,7 +437,7 @@ async def successors(draft: Draft, place: DraftPlace, new: DraftPlace, *, is_giv
     found = [place]
     for child in list(place.children.values()):
         child.know_spec()
-        if (is_given or is_far(place)) and not child.is_awaited:
+        if (is_given or place.is_far) and not child.is_awaited:
             check_handed(child, place, new)
         if child.begins_anew and not child.is_stopped:
             found += await successors(draft, child, new, is_given=is_given)

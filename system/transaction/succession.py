@@ -160,6 +160,14 @@ class Succession:
         place.was.start = self.left.was.start = place.spec.start
         place.cell, place.is_planned = None, True
 
+    def check(self) -> None:
+        """Whether another one can take its place with all else that the transaction wants of it. Raises SpecError."""
+        if self.place.rework is not None:
+            raise wrong(
+                self.place.path,
+                "another one takes its place by this very transaction: suspend or resume it in the next one",
+            )
+
     # -- before the commit --------------------------------------------------------------------------------------------
 
     async def wind_down(self, system: ActorSystem) -> None:

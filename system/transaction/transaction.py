@@ -159,7 +159,7 @@ class Transaction:
         except BaseException as error:
             if isinstance(error, TimeoutError):
                 waits = "; ".join(filter(None, (waiting, "" if at is None else at.waits_for)))
-                waits = waits or ("" if at is None else await system._turn_in_hand(at.target))
+                waits = waits or ("" if at is None else await system._turn_in_hand(at.target, is_left=True))
                 cause = f"not within {self._timeout:g} s{f': {waits}' if waits else ''}"
             else:
                 cause = said(error)

@@ -12,6 +12,7 @@ from nats.js.api import StorageType
 from typer.testing import CliRunner, Result
 
 import holdfast as hf
+from holdfast.cluster.nats.access import access_of
 from holdfast.cluster.nats.server_file import UserRole
 from holdfast.cluster.nats.system_streams import SubjectNames, stream_settings
 from holdfast.console.commands import commands
@@ -29,10 +30,14 @@ def test_the_files_are_such_that_a_server_takes_them(tmp_path: Path) -> None:
     folder = tmp_path / "servers"
     done = nats("config", str(folder), "--system", "app", *3 * ("--host", "127.0.0.1"), "--store-dir", str(tmp_path))
     assert done.exit_code == 0
-    assert [Path(line).name for line in done.output.split()] == [
+    *files, told = done.output.splitlines()
+    assert [Path(line).name for line in files] == [
         *("nats-1.conf", "nats-2.conf", "nats-3.conf"),
         *("app-node.nk", "app-client.nk", "app-observer.nk"),
     ]
+    servers = "127.0.0.1:4222,127.0.0.1:4223,127.0.0.1:4224"
+    assert told == f'app: store="nats://{servers}/app?nkey={folder}/app-node.nk"'
+    assert access_of(told.partition('"')[2].rstrip('"')).servers[1] == "nats://127.0.0.1:4223"
     for number in range(3):
         file = folder / f"nats-{number + 1}.conf"
         subprocess.run([server_binary(), "-t", "-c", str(file)], check=True, capture_output=True, timeout=60)

@@ -79,6 +79,77 @@ async def test_draining_goes_on_over_a_crash(system: hf.ActorSystem, start_one: 
     assert await last == (2 if "recorded" in way else 1)
 
 
+class OnesOwn(hf.Message):
+    left: int
+
+
+class ToItself(Account):
+    """Tells itself the next number until none is left, as `{continue, Term}` would."""
+
+    def __init__(self, told: str) -> None:
+        super().__init__()
+        self.told = told
+
+    @hf.on(OnesOwn)
+    async def own(self, message: OnesOwn) -> None:
+        if message.left:
+            self.ctx.ref.tell(OnesOwn(message.left - 1))
+            await self.ctx.ref.send(OnesOwn(0))
+        with Path(self.told).open("a") as file:
+            file.write(f"{message.left} ")
+
+
+async def test_what_an_actor_tells_itself_while_it_is_drained_is_handled(
+    system: hf.ActorSystem, start_one: Starter, tmp_path: Path
+) -> None:
+    told, gate = tmp_path / "told", tmp_path / "gate"
+    one = await start_one(hf.start(ToItself, str(told)), shutdown=8.0)
+    waiting = one.ask(Wait(str(gate)), timeout=30.0)
+    one.tell(OnesOwn(3))
+    await until_there(tmp_path / "gate.begun")
+    stopping = asyncio.create_task(system.stop(one, drain=True, deadline=30.0))
+    await asyncio.sleep(0)
+    gate.touch()
+    await stopping
+    assert await waiting == "waited"
+    assert sorted(told.read_text().split()) == ["0", "0", "0", "0", "1", "2", "3"]
+
+
+class Bound(hf.Message):
+    path: str
+
+
+class BoundTo(Account):
+    @hf.on(Bound)
+    def bind(self, message: Bound) -> None:
+        self.ctx.link(self.ctx.find(message.path, hf.Actor))
+
+
+async def has_ended(one: hf.ActorRef[Any]) -> bool:
+    try:
+        await one.ask(Total(), timeout=30.0)
+    except hf.ActorStopped:
+        return True
+    return False
+
+
+async def test_an_untrapped_exit_keeps_its_place(system: hf.ActorSystem, start_one: Starter, tmp_path: Path) -> None:
+    """Behind the turn in hand and all that is queued, wherever the actor lives, and also over a kill in between."""
+    one, gate = await start_one(hf.start(BoundTo), shutdown=8.0, restart="transient"), tmp_path / "gate"
+    other = await system.start(hf.child("other", hf.start(Account), restart="temporary"))
+    await one.ask(Bound(other.path))
+    waiting = one.ask(Wait(str(gate)), timeout=30.0)
+    queued = [one.ask(Add(1), timeout=30.0) for _ in range(3)]
+    await until_there(tmp_path / "gate.begun")
+    await system.terminate(other, BY_HAND)
+    assert (await system.get_status(one)).turn is not None
+    gate.touch()
+    assert await waiting == "waited"
+    assert await asyncio.gather(*queued) == [1, 2, 3]
+    while not await has_ended(one):
+        pass
+
+
 async def test_draining_ends_at_its_deadline(system: hf.ActorSystem, start_one: Starter) -> None:
     one = await start_one(hf.start(Account), shutdown=8.0)
     await system.suspend(one)

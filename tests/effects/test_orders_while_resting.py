@@ -288,3 +288,26 @@ async def test_a_turn_that_ends_by_itself_while_it_is_to_be_left_ends_once(tmp_p
                     await end_of(system, isolation, ref.path)
                 assert await ref.ask(Who(), IN_TIME) == "new"
                 assert await ref.ask(Count(), IN_TIME) == 11
+
+
+async def test_what_helps_where_a_turn_is_not_left_is_said_and_helps(tmp_path: Path) -> None:
+    async with running(tmp_path, "os") as system:
+        await system.start(hf.supervisor("team", isolation="process", children=[patient("task")]))
+        ref = system.ref("/app/team/patient", Patient)
+        asked = asyncio.ensure_future(ref.ask(Go(["c"]), IN_TIME))
+        await waits(system, ref.path)
+        helps = "/app/team has a process, below which a turn that waits is not left: have it live as a task"
+        with pytest.raises(hf.TransactionFailed, match=helps):
+            async with system.transaction(timeout=0.1) as change:
+                change.replace_code(ref, Newer)
+        with pytest.raises(hf.AskTimeout, match=helps):
+            await system.suspend(ref, timeout=0.1)
+        for isolation in ("task", "process"):
+            async with system.transaction(timeout=IN_TIME) as change:
+                change.isolation("/app/team", isolation)
+            if isolation == "task":
+                async with system.transaction(timeout=IN_TIME) as change:
+                    change.replace_code(ref, Newer)
+        assert system.pid_of(ref) != os.getpid()
+        await ref.ask(Call("a"), IN_TIME)
+        assert await asked == "newer: call a"

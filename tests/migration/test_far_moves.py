@@ -410,11 +410,12 @@ async def test_what_cannot_be_is_refused_before_anything_is_done(system: hf.Acto
 
     def both(change: Any) -> None:
         change.move("/app/far/one", "/app/near")
-        change.isolation("/app/near/one", "process")
+        change.suspend("/app/near/one")
 
-    with pytest.raises(hf.TransactionFailed, match="in a transaction of its own"):
-        async with system.transaction(timeout=IN_TIME) as change:
-            both(change)
+    for dry_run in (True, False):
+        with pytest.raises(hf.TransactionRefused, match="in a transaction of its own"):
+            async with system.transaction(timeout=IN_TIME, dry_run=dry_run) as change:
+                both(change)
 
 
 class Slow(hf.Actor):

@@ -535,6 +535,15 @@ async def ticks_are_left_out_while_one_waits(system: hf.ActorSystem) -> None:
 class Link(hf.Message): ...
 
 
+class Tie(hf.Message):
+    path: str
+    by: str
+
+
+class Nap(hf.Message):
+    seconds: float
+
+
 class Linked(Scribe):
     def on_start(self, restored: bool) -> None:
         self.ctx.trap_exits = True
@@ -557,6 +566,100 @@ async def a_link_hears_nothing_of_a_crash_that_is_recovered_from(system: hf.Acto
     assert await ref.ask(Told()) == []
     await system.stop(other)
     assert await ref.ask(Told()) == ["shutdown"]
+
+
+class Follows(Scribe):
+    """Linked with, monitors or watches another one, and traps no exits."""
+
+    @hf.on(Tie)
+    def tie(self, message: Tie) -> None:
+        other = self.ctx.find(message.path, hf.Actor)
+        {"link": self.ctx.link, "monitor": self.ctx.monitor, "watch": self.ctx.watch}[message.by](other)
+
+    @hf.on(Nap)
+    async def nap(self, message: Nap) -> None:
+        await asyncio.sleep(message.seconds)
+        self.told.append("slept")
+
+    def on_down(self, source: hf.ActorRef[hf.Actor], reason: hf.ExitReason, recovering: bool) -> None:
+        self.told.append(f"{reason}, {recovering}")
+
+
+async def linked(system: hf.ActorSystem) -> hf.ActorRef[Follows]:
+    """Whoever ends with `other`; its queue is empty."""
+    await system.start(hf.child("other", hf.start(Scribe), restart="temporary"))
+    one = await system.start(hf.child("one", hf.start(Follows), restart="temporary"))
+    await one.ask(Tie(f"{one.path.rpartition('/')[0]}/other", "link"))
+    return one
+
+
+@entry("an EXIT that is not trapped")
+async def an_exit_waits_for_its_place(system: hf.ActorSystem) -> None:
+    one = await linked(system)
+    one.tell(Nap(10.0))
+    queued = [one.ask(Told(), 30.0) for _ in range(3)]
+    begin = asyncio.get_running_loop().time()
+    system.ref(f"{one.path.rpartition('/')[0]}/other").kill()
+    await asyncio.sleep(1.0)
+    with pytest.raises(hf.ActorStopped):
+        await one.ask(Told(), 30.0)
+    assert asyncio.get_running_loop().time() - begin == pytest.approx(10.0)
+    assert await asyncio.gather(*queued) == 3 * [["slept"]]
+
+
+@entry("an EXIT to a suspended process")
+async def a_suspended_actor_ends_when_it_is_resumed(system: hf.ActorSystem) -> None:
+    one = await linked(system)
+    await system.suspend(one)
+    system.ref(f"{one.path.rpartition('/')[0]}/other").kill()
+    await asyncio.sleep(1.0)
+    assert (await system.get_status(one)).state == "suspended"
+    await system.resume(one)
+    with pytest.raises(hf.ActorStopped):
+        await one.ask(Told())
+
+
+@entry("DOWN of an actor that recovers")
+async def a_life_may_end_by_two_downs(system: hf.ActorSystem) -> None:
+    child = hf.child("other", hf.start(Scribe), recovery=hf.hybrid())
+    await system.start(hf.supervisor("team", intensity=0, restart="temporary", children=[child]))
+    one = await system.start(hf.child("one", hf.start(Follows)))
+    root = one.path.rpartition("/")[0]
+    for by in ("monitor", "watch"):
+        await one.ask(Tie(f"{root}/team/other", by))
+    system.ref(f"{root}/team/other").kill()
+    await asyncio.sleep(1.0)
+    assert sorted(await one.ask(Told())) == ["killed, False", "killed, False", "killed, True"]
+
+
+@entry("a pid of an address where nobody lives")
+async def find_raises_where_nobody_lives(system: hf.ActorSystem) -> None:
+    for recovery in (None, hf.hybrid()):
+        one = await system.start(hf.child(f"one-{recovery}", hf.start(Follows), recovery=recovery))
+        tied = one.ask(Tie(f"{one.path.rpartition('/')[0]}/nobody", "monitor"))
+        if recovery is None:
+            with pytest.raises(hf.RemoteCrash, match="NoSuchActor"):
+                await tied
+        else:
+            await tied
+            assert await one.ask(Told()) == ["no such actor, False"]
+
+
+class LastWord(Lingers):
+    @hf.on(Leave)
+    def leave(self, message: Leave) -> str:
+        self.ctx.stop()
+        return "gone"
+
+
+@entry("`{stop, Reason, Reply, State}`")
+async def a_last_reply_leaves_before_on_stop(system: hf.ActorSystem) -> None:
+    one = await system.start(hf.child("one", hf.start(LastWord, 2.0), restart="temporary"))
+    begin = asyncio.get_running_loop().time()
+    await one.ask(Leave())
+    assert asyncio.get_running_loop().time() - begin < 2.0
+    await system.stop(one)
+    assert asyncio.get_running_loop().time() - begin == pytest.approx(2.0)
 
 
 REAL = ["specs_from_processes_stay_packed", "what_a_turn_has_told_leaves_its_process_behind_it"]

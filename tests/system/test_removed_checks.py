@@ -29,6 +29,8 @@ FAR_NAMED = "tests/control/test_far_names.py"
 SLOW = "tests/supervision/test_slow_restarts.py"
 UPGRADE = "tests/system/upgrade/test_check_upgrade.py"
 SAME_CLASS = "tests/system/upgrade/test_same_class_everywhere.py"
+DRY_RUNS = "tests/system/test_dry_runs.py"
+STOP = "tests/control/test_stop.py"
 COLLECTIONS = "tests/system/test_full_collections.py"
 CHANGES = "tests/effects/test_changes_of_races.py"
 ORDERS = "tests/effects/test_orders_while_resting.py"
@@ -328,8 +330,8 @@ CHECKS = {
     ),
     "who keeps its address need not come to rest": Check(
         "system/transaction/reparenting.py",
-        "addressed(self._top) if self._is_readdressed(system) else ():",
-        "addressed(self._top):",
+        "addressed_alone(self._top, own) if self._is_readdressed(system) else ():",
+        "addressed_alone(self._top, own):",
         RESTING,
         "a_supervisor_is_given_a_process and list",
     ),
@@ -832,8 +834,8 @@ CHECKS = {
     ),
     "who was lodged in a process lives where it did if the move is given up": Check(
         "system/transaction/handing.py",
-        "        if self._is_lodged and cell is not None:\n",
-        "        if False:\n",
+        "                if self._is_lodged:\n",
+        "                if False:\n",
         FAR,
         "test_a_move_that_is_given_up",
     ),
@@ -1570,8 +1572,8 @@ CHECKS = {
     ),
     "the flags of a transaction leave the template in a process": Check(
         "system/transaction/arrangement.py",
-        "children = None if place.is_dynamic else list(",
-        "children = list(",
+        "children = None if place.is_dynamic else specs",
+        "children = specs",
         CHANGED,
         "leaves_the_template and process",
     ),
@@ -1665,6 +1667,69 @@ CHECKS = {
         "True",
         "tests/system/test_two_systems.py",
         "test_a_ref_of_another_system",
+    ),
+    "who is given away is not changed by the same transaction": Check(
+        "system/transaction/draft.py",
+        "            handing.check()\n",
+        "            pass\n",
+        DRY_RUNS,
+        "test_what_a_dry_run_refuses and uvloop",
+    ),
+    "a supervisor whose place is taken is not suspended by the same transaction": Check(
+        "system/transaction/draft.py",
+        "            succession.check()\n",
+        "            pass\n",
+        DRY_RUNS,
+        "test_what_a_dry_run_refuses and uvloop",
+    ),
+    "a supervisor that will be suspended has nobody to stop behind the commit": Check(
+        "system/transaction/draft.py",
+        "return self.is_leaving or (self.is_switched and self.is_stopped) or self.comes_last",
+        "return self.is_leaving",
+        DRY_RUNS,
+        "test_what_a_dry_run_refuses and uvloop",
+    ),
+    "who is moved by another step is brought to rest by that step": Check(
+        "system/transaction/reparenting.py",
+        "if place in own or not place.has_moved:",
+        "if True:",
+        DRY_RUNS,
+        "test_what_a_dry_run_approves and supervisor and uvloop",
+    ),
+    "a child may be given to a supervisor that a later step starts": Check(
+        "system/transaction/handing.py",
+        "return self._above.is_planned and self._above.cell is None",
+        "return False",
+        DRY_RUNS,
+        "test_what_a_dry_run_approves and out and uvloop",
+    ),
+    "a supervisor in a process hears of a child as it has it": Check(
+        "system/transaction/arrangement.py",
+        "come[spec.id].spec_on_the_way(spec) if spec.id in come else spec",
+        "spec",
+        DRY_RUNS,
+        "test_what_a_dry_run_approves and strategy and uvloop",
+    ),
+    "code is asked beforehand whether it takes the arguments, also of an actor that lives elsewhere": Check(
+        "system/transaction/living.py",
+        "elif (spec := place.know_spec()) is not None:",
+        "elif (spec := place.know_spec()) is not None and False:",
+        DRY_RUNS,
+        "test_code_that_does_not_take and uvloop",
+    ),
+    "what an actor tells itself while it is drained is let in": Check(
+        "actors/kernel/mailbox.py",
+        "if is_of_its_own(cell) and not isinstance(item, Ask):",
+        "if False:",
+        STOP,
+        "test_what_an_actor_tells_itself and task and not recorded",
+    ),
+    "and is waited for where it lives": Check(
+        "actors/control/drain.py",
+        "if not behind and cell",
+        "if cell",
+        STOP,
+        "test_what_an_actor_tells_itself and process and not recorded",
     ),
     "a connection is refused before a library is missed": Check(
         "cluster/servers.py",

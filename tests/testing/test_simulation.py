@@ -328,3 +328,13 @@ def test_a_run_that_gives_up_at_its_end_leaves_the_world_as_it_was() -> None:
             run_schedule(whole, Walk(1), {"system"}, {}, ticks=300)
         assert (random.seed, time.time) == (seeding, clock)
         assert 0.0 <= time.time() - now < 60.0
+
+
+@simulate(seeds=1)
+async def test_who_has_no_process_is_told_whose_is_to_be_killed(system: GuardedSystem, simulation: Simulation) -> None:
+    await system.start(hf.supervisor("team", isolation="process", children=[hf.child("log", hf.start(Log))]))
+    await system.start(hf.child("alone", hf.start(Log)))
+    with pytest.raises(hf.SpecError, match="kill that of /app/team, in which it lives"):
+        simulation.kill_process(system.ref("/app/team/log", Log))
+    with pytest.raises(hf.SpecError, match=r"has no process of its own$"):
+        simulation.kill_process(system.ref("/app/alone", Log))
