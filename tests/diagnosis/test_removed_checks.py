@@ -573,8 +573,8 @@ CHECKS = {
     ),
     "silence without input is no fault": Check(
         "diagnosis/observers/flow.py",
-        "is_by_clock = not flow.inputs and learned",
-        "is_by_clock = learned",
+        "is_by_clock = not flow.inputs and is_steady and learned",
+        "is_by_clock = is_steady and learned",
         FLOW,
         "when_its_input_stops",
     ),
