@@ -586,7 +586,7 @@ class RepairGaveUp(Event, frozen=True, eq=False):
 
 
 class RepairTold(Event, frozen=True, eq=False):
-    """What repair has told of a case, as one sentence; `what` is the kind of the notice, such as "Planned"."""
+    """Repair tells of a case, in one sentence; `what` is the kind of the notice, such as "Planned"."""
 
     case: int
     what: str

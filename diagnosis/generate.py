@@ -35,9 +35,17 @@ from .literals import (
 )
 from .messages import DIAGNOSIS, EXPLANATION, GRACE, MODEL, OBSERVATIONS, REPAIR, ROS_DIAGNOSTICS, STARTS
 from .model import Component, Declaration, Expectation, Kind, ModelError
-from .observers.flow import MOST_ARRIVALS, Arrival, Baselines, FlowObserver, FlowSource
+from .observers.flow import (
+    MOST_ARRIVALS,
+    Arrival,
+    Baselines,
+    FlowObserver,
+    FlowSource,
+    hear_lines,
+    lines_topic,
+    told_lines,
+)
 from .observers.hearing import Heard, listen
-from .observers.lines import hear_lines, lines_topic, told_lines
 from .observers.node_observer import NodeObserver
 from .observers.observer import Manner, Observer
 from .observers.replicas import ReplicaObserver

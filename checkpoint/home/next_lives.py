@@ -7,11 +7,13 @@ actor is to end before that. If nobody will live there again, the turn hears so.
 
 from __future__ import annotations
 
+import asyncio
 import functools
 from collections.abc import Callable, Collection
 from typing import TYPE_CHECKING, NamedTuple
 
 from ...actors.errors import ActorStopped, AskFailed
+from ...actors.exit_reasons import ExitReason
 from ...actors.kernel.cell import DOWN, GONE, RUNNING, Cell
 from ...actors.kernel.node import cell_kind
 from .recorded_home import switch_of
@@ -115,7 +117,10 @@ class NextLives:
         if there.state is DOWN:
             self._homes.node.loop.call_soon(self._send, ask)
         else:
-            there.ended().add_done_callback(lambda _: self._go_on(ask))
+            there.ended().add_done_callback(functools.partial(self._again, ask))
+
+    def _again(self, ask: SwitchAsk, ended: asyncio.Future[ExitReason]) -> None:
+        self._go_on(ask)
 
     def _send(self, ask: SwitchAsk) -> None:
         ask.switch.outputs.send_ask(ask.chain[0][1], ask.target, ask)

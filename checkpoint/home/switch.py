@@ -74,10 +74,10 @@ from ..snapshot.snapshot_schedule import SnapshotSchedule
 from ..snapshot.state_image import IMAGE_BYTES
 from ..upgrade.present_classes import REPLY_TO
 from .admission import taken_up
+from .capacity import Limit
 from .disposal import lose, put_into_quarantine, undo_begun
 from .held_messages import Intake, let_go
 from .input_ledger import InputLedger, stop_entry
-from .journal_limit import Limit
 from .life_ports import SENT
 from .outputs import Outputs
 from .pending_asks import PendingCalls, SwitchAsk, answer_ask, origin_of

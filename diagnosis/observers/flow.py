@@ -5,21 +5,23 @@ from __future__ import annotations
 import asyncio
 import math
 import time
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from copy import copy
 from pathlib import Path
 from typing import Any, Final
 
 import msgspec
 
+from ...actors.events import Event, LogLine
 from ...actors.kernel.actor import on
 from ...actors.kernel.address_host import Work
 from ...actors.kernel.cell import Cell
+from ...actors.kernel.node import Node
+from ...supervision.services.program import Program
 from ..kept_file import read_kept, write_kept
 from ..literals import ok, word_for
 from ..own_time import OwnTime
 from .hearing import Heard, listen
-from .lines import hear_lines, lines_topic
 from .observer import Manner, Observer
 
 ENOUGH: Final = 20
@@ -377,3 +379,36 @@ def _had_turns(before: Work, now: Work) -> bool:
 
 def _is_idle(cell: Cell, work: Work) -> bool:
     return not work.is_in_turn and not cell.host.backlog(cell)
+
+
+# -- lines that programs print for an actor: a topic of the program --------------------------------------------------
+
+
+def lines_topic(program: str) -> str:
+    """The name under which the lines of the program at an address are a topic."""
+    return f"{program}.lines"
+
+
+def told_lines(cell: Cell) -> str | None:
+    """The address of whoever is told the lines of this program of this process; None: nobody, or it is none."""
+    to = cell.actor.lines_to if isinstance(cell.actor, Program) else None
+    if to is None or to.startswith("/"):
+        return to
+    named = cell.node.names.get(to)
+    return None if named is None else named.path
+
+
+async def hear_lines(node: Node, heard: Callable[[str], None]) -> None:
+    """Call `heard` with the program's address for each line that an actor is told; without end."""
+
+    def listen(event: Event) -> None:
+        if isinstance(event, LogLine):
+            cell = node.find(event.address)
+            if cell is not None and isinstance(cell.actor, Program) and cell.actor.lines_to is not None:
+                heard(event.address)
+
+    node.events.add_sink(listen)
+    try:
+        await asyncio.get_running_loop().create_future()
+    finally:
+        node.events.remove_sink(listen)

@@ -109,7 +109,7 @@ class Program(Actor):
 
     @property
     def lines_to(self) -> str | None:
-        """Who is told each line of it: an address, or a registered name."""
+        """The receiver of each line of its output: an address, or a registered name; None: there is none."""
         return self._order.lines_to
 
     # -- start ------------------------------------------------------------------------------------------------------

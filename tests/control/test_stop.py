@@ -134,7 +134,7 @@ async def has_ended(one: hf.ActorRef[Any]) -> bool:
 
 
 async def test_an_untrapped_exit_keeps_its_place(system: hf.ActorSystem, start_one: Starter, tmp_path: Path) -> None:
-    """Behind the turn in hand and all that is queued, wherever the actor lives, and also over a kill in between."""
+    """Behind the turn in hand and all that is queued, wherever the actor lives."""
     one, gate = await start_one(hf.start(BoundTo), shutdown=8.0, restart="transient"), tmp_path / "gate"
     other = await system.start(hf.child("other", hf.start(Account), restart="temporary"))
     await one.ask(Bound(other.path))

@@ -647,9 +647,8 @@ async def find_raises_where_nobody_lives(system: hf.ActorSystem) -> None:
 
 class LastWord(Lingers):
     @hf.on(Leave)
-    def leave(self, message: Leave) -> str:
+    def leave(self, message: Leave) -> None:
         self.ctx.stop()
-        return "gone"
 
 
 @entry("`{stop, Reason, Reply, State}`")

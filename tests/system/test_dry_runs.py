@@ -82,7 +82,7 @@ REFUSED = [
     ("suspend above", "move a supervisor out"),
 ]
 """Pairs of which each step alone is approved."""
-PAIRS = list(itertools.product(STEPS, repeat=2))
+PAIRS = list(itertools.product(STEPS, STEPS))
 
 
 async def grow(system: hf.ActorSystem) -> dict[str, hf.ActorRef[Any]]:
