@@ -797,7 +797,7 @@ class ScheduleSearch:
 def _written(folder: Path, failure: BaseException, text: str, recorder: Recorder, note: str, nodeid: str) -> list[str]:
     """Write the schedule, the chart, and what failed with all turns as text beside each other, and say where."""
     folder.mkdir(parents=True, exist_ok=True)
-    turns = [f"{row.at:.6f}\t{row.sender or '-'}\t{row.path}\t{row.what}\t{row.change}" for row in recorder.rows]
+    turns = [f"{row.at:.6f}\t{row.source or '-'}\t{row.name}\t{row.what}\t{row.change}" for row in recorder.rows]
     said = [
         nodeid,
         *traceback.format_exception_only(failure),

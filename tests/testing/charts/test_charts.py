@@ -111,7 +111,7 @@ def test_bystanders_are_left_out() -> None:
     lines = raised.value.__notes__[0].splitlines()
     assert lines[2] == "the 7 turns that lead to it (20 turns of 20 other actors left out):"
     assert sorted(lines[3].split()) == ["account", "one", "other"]
-    assert len(lines) == 11
+    assert len([line for line in lines if re.match(r" +\d+\.\d{3} ", line)]) == 7
     assert "bystander" not in raised.value.__notes__[0]
 
 
