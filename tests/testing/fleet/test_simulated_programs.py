@@ -279,7 +279,7 @@ def test_a_bug_that_a_split_shows_is_found_shrunk_and_shown() -> None:
     assert "left behind: program 1, client" in told
     assert "program 1:lock" in told
     assert "program 2:lock" in told
-    assert "left behind: program 1, client 2" in fails(two_hold_one_lock, seed=None, replay="seed=10 fault=3:1,6:1")
+    assert "left behind: program 1, client" in fails(two_hold_one_lock, seed=None, replay="seed=10 fault=3:1,6:1")
 
 
 def test_an_actor_that_is_recorded_gives_no_lock_that_another_program_gives() -> None:
