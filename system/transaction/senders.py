@@ -91,6 +91,10 @@ class OtherSenders:
         """Some have not come to rest in time: the next time those are not waited for."""
         self._restless = {switch for switch, (_, rest) in self._rests.items() if not rest.is_waiting}
 
+    def have_all_rest(self) -> None:
+        """The next time those are waited for again that had not come to rest in time."""
+        self._restless.clear()
+
     def waits_for(self, others: Iterable[Switch]) -> str:
         """Whose snapshot is not there yet; "" if nobody's is missing."""
         late = next(filter(is_unsettled, others), None)

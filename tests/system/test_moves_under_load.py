@@ -12,6 +12,10 @@ from typing import Any
 import pytest
 
 import holdfast as hf
+from holdfast.actors.errors import CannotMove
+from holdfast.actors.kernel.cell import Cell
+from holdfast.actors.migration.move import CommitGate
+from holdfast.system.live_moves import Moves
 
 IN_TIME = 30.0
 SEED = int(os.environ.get("HOLDFAST_SEED", "20261128"))
@@ -129,6 +133,30 @@ async def test_a_move_comes_to_its_end_while_a_recorded_actor_sends(
         async with system.transaction(timeout=IN_TIME) as change:
             change.move(f"/app/{old}/{who}", f"/app/{new}")
     await judge(system, "/app/south/a" if who == "a" else "/app/north/a", ["load"])
+
+
+async def test_one_that_did_not_come_to_rest_in_time_is_tried_again(
+    system: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It sends all the time, so it has to stand still, and there is no moment without."""
+    await sides(system, hf.hybrid())
+    await system.start(load("load", 0.001))
+    await sends(system, "/app/north/a", "load")
+    pause, late = Moves.pause, list[str]()
+
+    async def late_at_first(moves: Moves, cell: Cell, timeout: float, gate: CommitGate) -> None:
+        if cell.path == "/app/load" and not late:
+            late.append(cell.path)
+            given_up: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+            gate.on_closed(given_up.set_result)
+            raise CannotMove(cell.path, await given_up)
+        await pause(moves, cell, timeout, gate)
+
+    monkeypatch.setattr(Moves, "pause", late_at_first)
+    async with system.transaction(timeout=IN_TIME) as change:
+        change.move("/app/north/a", "/app/south")
+    assert late == ["/app/load"]
+    await judge(system, "/app/south/a", ["load"])
 
 
 async def test_two_moves_of_one_transaction_share_the_senders(system: hf.ActorSystem) -> None:

@@ -55,6 +55,13 @@ UNCODABLE = "tests/system/test_uncodable.py"
 SHUTDOWN = "tests/supervision/test_shutdown.py"
 
 CHECKS = {
+    "who did not stand still in time is tried again": Check(
+        "system/transaction/reparenting.py",
+        "            self._senders.have_all_rest()\n",
+        "",
+        "tests/system/test_moves_under_load.py",
+        "test_one_that_did_not_come_to_rest_in_time",
+    ),
     "who is kept from being heard is not silent": Check(
         "supervision/services/program.py",
         "        return self._is_held or (more is not None and more.suspended != 0)\n",
