@@ -154,7 +154,7 @@ class Regrouping(StagedWork):
         standing = self._senders.find_standing(others, self._held(system))
         waits = self._senders.waits_for(one for one in others if one not in standing) or self._unsteady(system)
         self._kept_from_rest = waits
-        if waits:  # Perhaps for what those here have to answer, or for one that would have to stand still after all.
+        if waits:  # Perhaps for what those here have to answer.
             self._senders.have_all_rest()
             await self._go_on(system)
         if waits or not await self._rest(system) or self._why_not_moved(system):

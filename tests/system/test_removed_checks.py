@@ -883,8 +883,8 @@ CHECKS = {
     ),
     "who rests is let go of when others have to be waited for": Check(
         "system/transaction/reparenting.py",
-        "        if waits:  # Perhaps for what those here have to answer.\n",
-        "        if False:\n",
+        "            self._senders.have_all_rest()\n            await self._go_on(system)\n",
+        "            self._senders.have_all_rest()\n",
         MOVED,
         "test_it_answers_whoever_asks",
     ),
