@@ -43,9 +43,11 @@ import psutil
 
 MODULES = (
     "holdfast.system.worker_main", "holdfast.actors.process.fork.zygote", "holdfast.ftm.replica.replica",
-    "pytest", "hypothesis", "psutil", "uvloop", "holdfast.console.commands", "typer", "rich.console",
+    "pytest", "hypothesis", "psutil", "uvloop",
 )  # fmt: skip
-"""What nearly every fork server of the tests imports, or every command of the command line."""
+"""What nearly every fork server of the tests imports."""
+OF_COMMANDS = ("typer", "rich.console", "holdfast.console.commands")
+"""The same of the command line, where that is installed."""
 AT_START = ("PYTHON", "LD_", "MALLOC_", "GLIBC_", "LC_", "LANG", "COVERAGE", "OMP_", "OPENBLAS_", "MKL_")
 """Variables that are read once, as a program or a module begins."""
 LIMITS = tuple(getattr(resource, name) for name in dir(resource) if name.startswith("RLIMIT_"))
@@ -278,7 +280,7 @@ def warm_up(control: socket.socket) -> None:
     sys.modules["warm_boot"] = boot
     spec.loader.exec_module(boot)
     boot.adopt_package(begin["package"], begin["package_path"])
-    for name in MODULES:
+    for name in (*MODULES, *(OF_COMMANDS if importlib.util.find_spec("typer") is not None else ())):
         importlib.import_module(name)
     for place in sys.modules["holdfast.console.commands"].PLACES.values():
         importlib.import_module(f"holdfast.console.{place.partition(':')[0]}")
