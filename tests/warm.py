@@ -280,10 +280,13 @@ def warm_up(control: socket.socket) -> None:
     sys.modules["warm_boot"] = boot
     spec.loader.exec_module(boot)
     boot.adopt_package(begin["package"], begin["package_path"])
-    for name in (*MODULES, *(OF_COMMANDS if importlib.util.find_spec("typer") is not None else ())):
+    for name in MODULES:
         importlib.import_module(name)
-    for place in sys.modules["holdfast.console.commands"].PLACES.values():
-        importlib.import_module(f"holdfast.console.{place.partition(':')[0]}")
+    if importlib.util.find_spec("typer") is not None:
+        for name in OF_COMMANDS:
+            importlib.import_module(name)
+        for place in sys.modules["holdfast.console.commands"].PLACES.values():
+            importlib.import_module(f"holdfast.console.{place.partition(':')[0]}")
     import gc
 
     gc.collect()
