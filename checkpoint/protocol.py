@@ -474,7 +474,7 @@ class Waits(msgspec.Struct, array_like=True, tag=26):
     heard: int
 
 
-class Leaving(msgspec.Struct, array_like=True, tag=30):
+class LeavesTurn(msgspec.Struct, array_like=True, tag=30):
     """The life is to end behind the turn in hand: whose answers cannot come before that, it does not wait for."""
 
 
@@ -544,7 +544,7 @@ ToHome = (
     | Closed
     | Marked
     | Waits
-    | Leaving
+    | LeavesTurn
 )
 
 

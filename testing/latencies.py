@@ -318,7 +318,7 @@ class LateReplies:
         self._lines: dict[object, DelayLine] = {}
 
     def delaying(self, answer: Callable[[Any, object], None]) -> Callable[[Any, object], None]:
-        """As `Ask.answer`, later."""
+        """What stands in place of `Ask.answer`: the same, but later."""
 
         def late(ask: Any, reply: object) -> None:
             is_local = ask.to is not None and isinstance(ask.future, asyncio.Future) and not ask.future.done()

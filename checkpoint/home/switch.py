@@ -47,7 +47,7 @@ from ..protocol import (
     Go,
     Hooked,
     Ignored,
-    Leaving,
+    LeavesTurn,
     Live,
     Marked,
     Out,
@@ -486,7 +486,7 @@ class Switch:
                     self.images.mark(record)
                 case Waits():
                     life.waits(record.heard)
-                case Leaving():
+                case LeavesTurn():
                     self.calls.strand()
                 case Ignored():
                     life.fail(StartIgnored(self.path, record.why))

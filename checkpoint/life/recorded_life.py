@@ -53,7 +53,7 @@ from ..protocol import (
     Hooked,
     Ignored,
     Kept,
-    Leaving,
+    LeavesTurn,
     Live,
     Out,
     Outcome,
@@ -424,7 +424,7 @@ class Life:
             return
         self.stage.stopping = reason
         self.cell.urge(StopRecorded(self, reason))
-        self.port.to_home(Leaving())
+        self.port.to_home(LeavesTurn())
         self.leave_waiting()
 
     def leave_waiting(self) -> None:

@@ -50,6 +50,29 @@ Phase = Verifying | Finishing | Unclear | HeldByMode | Watching
 
 
 @dataclasses.dataclass(slots=True)
+class PresentPlan:
+    """What a case tries at the moment.
+
+    Attributes:
+        blamed: whom it is for.
+        aims: the symptoms that it is to mend.
+        begins_at: how many actions there were before it.
+        midway: whom it has begun to act on.
+        seen_again: those of its symptoms that were said again behind the grace of what was done.
+        is_vain: it was counted as one that has not helped.
+        undos: how it can be taken back, newest last.
+    """
+
+    blamed: frozenset[str] = frozenset()
+    aims: frozenset[Literal] = frozenset()
+    begins_at: int = 0
+    midway: set[str] = dataclasses.field(default_factory=set[str])
+    seen_again: set[Literal] = dataclasses.field(default_factory=set[Literal])
+    is_vain: bool = False
+    undos: list[tuple[Step, Undo]] = dataclasses.field(default_factory=list[tuple[Step, Undo]])
+
+
+@dataclasses.dataclass(slots=True)
 class Case:
     """What was seen and done so far.
 
@@ -57,13 +80,7 @@ class Case:
         phase: what the case waits for; None: the next round can begin.
         tried: plans that were carried out for each candidate.
         hopeless: candidates for which there is no plan, each with the reason.
-        blamed: whom the present plan is for.
-        midway: whom it has begun to act on.
-        before_plan: how many actions there were before the present plan.
-        aims: the symptoms that the present plan is to mend.
-        seen_again: those of them that were said again behind the grace of what was done.
-        is_vain: the present plan was counted as one that has not helped.
-        undos: how the present plan can be taken back, newest last.
+        plan: the present plan.
         advised: the advice for each candidate.
         useless: places of actions that were seen not to help.
         others: when each component was started by somebody else.
@@ -82,13 +99,7 @@ class Case:
     rounds: int = 0
     failures: list[str] = dataclasses.field(default_factory=list[str])
     phase: Phase | None = None
-    blamed: frozenset[str] = frozenset()
-    midway: set[str] = dataclasses.field(default_factory=set[str])
-    before_plan: int = 0
-    aims: frozenset[Literal] = frozenset()
-    seen_again: set[Literal] = dataclasses.field(default_factory=set[Literal])
-    is_vain: bool = False
-    undos: list[tuple[Step, Undo]] = dataclasses.field(default_factory=list[tuple[Step, Undo]])
+    plan: PresentPlan = dataclasses.field(default_factory=PresentPlan)
     advised: dict[tuple[str, ...], Advice] = dataclasses.field(default_factory=dict[tuple[str, ...], Advice])
     useless: set[int] = dataclasses.field(default_factory=set[int])
     others: dict[str, float] = dataclasses.field(default_factory=dict[str, float])
@@ -99,7 +110,7 @@ class Case:
     @property
     def reason(self) -> str:
         """Why the present plan is carried out, in words."""
-        return f"diagnosed: {', '.join(sorted(self.blamed))}"
+        return f"diagnosed: {', '.join(sorted(self.plan.blamed))}"
 
     def enter(self, phase: Phase | None, now: float) -> None:
         """Go on in another phase. The time in which a mode forbade everything does not count."""
@@ -115,25 +126,23 @@ class Case:
     def begin_plan(self, bad: tuple[str, ...], symptoms: Iterable[Literal]) -> None:
         """A plan for a candidate, which is to mend these symptoms, is carried out from now on."""
         self.rounds += 1
-        self.before_plan = len(self.actions)
         self.tried[bad] = self.tried.get(bad, 0) + 1
-        self.blamed, self.midway, self.undos = frozenset(bad), set(), []
-        self.aims, self.seen_again, self.is_vain = frozenset(symptoms), set(), False
+        self.plan = PresentPlan(frozenset(bad), frozenset(symptoms), len(self.actions))
 
     def take_carried_out(self) -> tuple[Step, ...]:
         """The steps of the present plan that were begun, once: then they are judged."""
-        steps, self.before_plan = tuple(self.actions[self.before_plan :]), len(self.actions)
+        steps, self.plan.begins_at = tuple(self.actions[self.plan.begins_at :]), len(self.actions)
         return steps
 
     def note_useless(self, names: Collection[str]) -> None:
         """The steps of the present plan on these components have not helped."""
-        begun = range(self.before_plan, len(self.actions))
+        begun = range(self.plan.begins_at, len(self.actions))
         self.useless.update(place for place in begun if set(self.actions[place].args[:1]) & set(names))
 
     def count_vain(self) -> bool:
         """Whether the present plan counts from now on as one that has not helped; once."""
-        was, self.is_vain = self.is_vain, True
-        return not was and self.before_plan < len(self.actions)
+        was, self.plan.is_vain = self.plan.is_vain, True
+        return not was and self.plan.begins_at < len(self.actions)
 
     def helpful(self) -> tuple[Step, ...]:
         """The actions that were done, but for those that were seen not to help."""
@@ -151,7 +160,7 @@ class Case:
     def count(self, step: Step) -> None:
         """A step is carried out."""
         self.actions.append(step)
-        self.midway.update(step.args[:1])
+        self.plan.midway.update(step.args[:1])
         for name in step.args[:1]:
             self.tries[name] = self.tries.get(name, 0) + 1
 

@@ -234,15 +234,15 @@ def seen_again(case: Case, outlook: Outlook, now: float) -> set[Literal]:
         for word in outlook.observations.words(symptom)
         if word.time > behind and word.is_current(now)
     }
-    return {symptom for symptom in case.aims if symptom in said}
+    return {symptom for symptom in case.plan.aims if symptom in said}
 
 
 def vain_in(case: Case, model: Model) -> set[str]:
     """Whom the present plan has touched in vain: all that it was to mend there was seen again, whatever comes later."""
     vain = set[str]()
-    for name in case.midway:
-        theirs = case.aims & {literal for atom in model.dependents((name,)) for literal in (atom, ~atom)}
-        if theirs and theirs <= case.seen_again:
+    for name in case.plan.midway:
+        theirs = case.plan.aims & {literal for atom in model.dependents((name,)) for literal in (atom, ~atom)}
+        if theirs and theirs <= case.plan.seen_again:
             vain.add(name)
     return vain
 
@@ -257,13 +257,13 @@ def why_overtaken(step: Step, case: Case, outlook: Outlook, policy: Policy, mode
         return f"mode {mode} does not allow it"
     if now < outlook.theirs.get(target, -math.inf):
         return f"somebody else has just started {target}"
-    if target in case.midway:
+    if target in case.plan.midway:
         return ""
     diagnosis = outlook.diagnosis
     if diagnosis.state is State.CONTRADICTORY:
         return "the observations are contradictory"
     if now < outlook.graced:
         return ""  # Nobody is blamed for a while: to be found good means nothing then.
-    if target in case.blamed and diagnosis.is_complete and target not in diagnosis.suspects:
+    if target in case.plan.blamed and diagnosis.is_complete and target not in diagnosis.suspects:
         return f"a new diagnosis finds {target} good"
     return ""

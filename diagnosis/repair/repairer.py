@@ -417,7 +417,7 @@ class Repairer(Actor):
         case.begin_plan(bad, self._outlook.diagnosis.symptoms)
         results = await self._executor(case).execute(problem, outcome)
         case.failures += [f"{result.step} {result.outcome}: {result.why}" for result in results if result.why]
-        case.undos = [(result.step, result.undo) for result in results if result.undo is not None]
+        case.plan.undos = [(result.step, result.undo) for result in results if result.undo is not None]
         if all(result.outcome in (UNVERIFIED, SKIPPED) for result in results):
             await self._take_back(case)  # Nobody sees its effect: that is no reason to do it again.
         if deciding.was_skipped(results):
@@ -488,17 +488,17 @@ class Repairer(Actor):
     def _note_vain(self, case: Case) -> None:
         """What was seen not to help has no credit if the symptoms go by themselves before the plan is judged."""
         again = deciding.seen_again(case, self._outlook, self.now())
-        if not again <= case.seen_again:
-            case.seen_again |= again
+        if not again <= case.plan.seen_again:
+            case.plan.seen_again |= again
             vain = deciding.vain_in(case, self._model)
             case.note_useless(vain)
-            if vain and vain >= case.midway:
+            if vain and vain >= case.plan.midway:
                 self._memory.useless += case.count_vain()
 
     async def _take_back(self, case: Case) -> None:
         """If the plan has not helped, count it, and undo of it what can be undone, the newest first."""
         suspects = set(self._outlook.diagnosis.suspects)
-        if is_blamed := bool(suspects & case.midway):  # Else it may have helped.
+        if is_blamed := bool(suspects & case.plan.midway):  # Else it may have helped.
             case.note_useless(self._outlook.diagnosis.certain)
             self._memory.useless += case.count_vain()
         steps = case.take_carried_out()  # Of a plan that was skipped, or judged before, there are none.
@@ -511,7 +511,7 @@ class Repairer(Actor):
                 continue
             if await answers(node, address, self._policy.caution.ping):
                 self._ledger.note_vain(step, now)  # It lives, and is as it was: once more would not be better.
-        undos, case.undos = case.undos, []
+        undos, case.plan.undos = case.plan.undos, []
         for step, undo in reversed(undos):
             try:
                 with self._arbiter.held(self._address(step), Hand.REPAIR, f"{step} has not helped"):

@@ -32,7 +32,7 @@ from ..rules import Rule
 from ..spec import ChildSpec, Restart, Shutdown, child
 from .program_lines import LineSender, receiver_in
 from .readiness import ReadySign, Sign, by_name, reached
-from .silence import SilenceWatch
+from .silent_programs import SilenceWatch
 
 Stop: TypeAlias = int | Sequence[str] | Callable[[int], Awaitable[object] | object]
 """How a program is asked to end: a signal, a command, or a function that is given its pid."""

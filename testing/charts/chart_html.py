@@ -34,7 +34,7 @@ def as_html(led: Sequence[ChartRow], rows: Sequence[ChartRow], title: str, note:
 
 
 def _drawn(rows: Sequence[ChartRow]) -> str:
-    """Turns as a picture."""
+    """These turns as an SVG picture, one below another."""
     names = columns(rows)
     place = {name: 110 + 150 * index for index, name in enumerate(names)}
     width, height = 150 * len(names) + 720, 24 * len(rows) + 70

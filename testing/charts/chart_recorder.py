@@ -94,7 +94,7 @@ class ChartRow:
 
 
 @dataclasses.dataclass(slots=True)
-class Sent:
+class SentMessage:
     """A message on its way.
 
     Attributes:
@@ -127,7 +127,7 @@ class OpenTurn(NamedTuple):
     life: int
     state: dict[str, str]
     is_of_user: bool
-    sent: Sent | None
+    sent: SentMessage | None
 
 
 Way = tuple[str, str, str]
@@ -153,13 +153,15 @@ class Recorder(TurnWatcher):
         self.heard: list[tuple[str, int]] = []
         self.asks: dict[int, tuple[asyncio.Future[Any], str]] = {}  # by their ids
         self.refused: list[tuple[BaseException, str]] = []
-        self.sent: list[Sent] = []
+        self.sent: list[SentMessage] = []
         self._moment = 0
         self.orders: dict[str, list[TurnCause]] = {}
-        self._asked: dict[int, tuple[Ask, int, Sent | None]] = {}  # by their ids, with the turns that handle them
+        self._asked: dict[
+            int, tuple[Ask, int, SentMessage | None]
+        ] = {}  # by their ids, with the turns that handle them
         self._open: dict[Cell, OpenTurn] = {}
-        self._ways: dict[Way, deque[Sent]] = {}
-        self._newest: dict[Way, Sent] = {}
+        self._ways: dict[Way, deque[SentMessage]] = {}
+        self._newest: dict[Way, SentMessage] = {}
         self._places: dict[object, str] = {}  # what is written before the addresses of a node
 
     def call(self, node: Node, name: str) -> None:
@@ -260,7 +262,7 @@ class Recorder(TurnWatcher):
 
     def _note(self, sender: str, to: str, message: object, *, is_ask: bool = False) -> None:
         self._moment += 1
-        sent = Sent(self._row_here(), self._moment, to, is_ask)
+        sent = SentMessage(self._row_here(), self._moment, to, is_ask)
         way = sender, to, _name(type(message).__qualname__)
         self._ways.setdefault(way, deque()).append(sent)
         self._newest[way] = sent
@@ -316,7 +318,7 @@ class Recorder(TurnWatcher):
                 found.append(TurnCause(self._moment, self.last[path], self._moment))
         return found
 
-    def _taken(self, cell: Cell, item: Any, source: str, name: str) -> Sent | None:
+    def _taken(self, cell: Cell, item: Any, source: str, name: str) -> SentMessage | None:
         """Where the message of this turn was sent."""
         ways = [] if isinstance(item, Tick) else [(source, cell.path, name)]
         for way in (*ways, (cell.path, cell.path, name)):

@@ -30,7 +30,7 @@ AS_USUAL: Final = Fate()
 LOST: Final = Fate(0)
 
 
-class Sent(NamedTuple):
+class SentFrame(NamedTuple):
     """What a program sends, as strikes show it."""
 
     program: str
@@ -64,7 +64,7 @@ class SendFaults:
         for strikes, target in self._installed:
             if strikes.at != at or target not in (None, program):
                 continue
-            match strikes.next(Sent(program.name, what)):
+            match strikes.next(SentFrame(program.name, what)):
                 case None:
                     continue
                 case "crash":

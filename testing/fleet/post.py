@@ -108,7 +108,7 @@ class SimPost:
         self._splits.remove(some)
 
     def heal(self) -> None:
-        """Let everything through again."""
+        """Let everything through again, whoever was cut off or split."""
         self._cuts.clear()
         self._splits.clear()
 

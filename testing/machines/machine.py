@@ -99,7 +99,6 @@ class ActorMachine(RuleBasedStateMachine):
         self._options: dict[str, Any] = {"seed": choices.seed, **OPTIONS, **running.get().options, **self.options}
         self._simulation = Simulation(choices, type(self).latency)
         self.faults = self._simulation.faults
-        self._choices = choices
         self._recorder = Recorder() if self._is_drawn and current_build_context().is_final else None
         self._lanes: list[asyncio.Future[Any]] = []
         self._asked: list[asyncio.Future[Any]] = []
@@ -145,8 +144,8 @@ class ActorMachine(RuleBasedStateMachine):
     def run(self, coro: Coroutine[Any, Any, T]) -> T:
         """Run a coroutine in the loop of the system, and return what it returns. The system goes on meanwhile."""
         try:
-            if isinstance(self._choices, Drawn):
-                self._choices.begin()
+            if isinstance(self._simulation.choices, Drawn):
+                self._simulation.choices.begin()
         except BaseException:  # Hypothesis ends the example: it has drawn too much.
             coro.close()
             raise
@@ -262,7 +261,7 @@ class ActorMachine(RuleBasedStateMachine):
 
     def _drawn_rounds(self) -> int | None:
         """How long the system goes on after this step."""
-        return PAUSES[self._choices.draw(ROUNDS, len(PAUSES), 0)]
+        return PAUSES[self._simulation.choices.draw(ROUNDS, len(PAUSES), 0)]
 
     async def _go_on(self, rounds: int | None) -> None:
         if rounds is None:
@@ -303,7 +302,7 @@ class ActorMachine(RuleBasedStateMachine):
             if self.model is not None and not has_failed:
                 linearizable(self.history, self.model).verify()
             if self._schedule is not None and not has_failed:
-                require_fit(self._schedule, self._choices)
+                require_fit(self._schedule, self._simulation.choices)
         except BaseException as error:
             self._note(error)
             raise
@@ -316,7 +315,7 @@ class ActorMachine(RuleBasedStateMachine):
 
     def _end(self) -> list[str]:
         """End the system and the loop. Returns what went wrong and was not expected."""
-        self._choices.end()
+        self._simulation.choices.end()
         try:
             problems = self.run(self._shut_down())
         finally:
@@ -349,7 +348,7 @@ class ActorMachine(RuleBasedStateMachine):
             return
         if self._shrinking.end():
             note(f"shrinking was cut short after {self.shrink_seconds:g} s (`shrink_seconds`)")
-        text = as_text(self._choices.seed, self._choices.kept())
+        text = as_text(self._simulation.choices.seed, self._simulation.choices.kept())
         note(f'repeat it outside of Hypothesis with {type(self).__name__}(schedule="{text}")')
         chart = chart_as_text(leading(self._recorder, failure), self._recorder.rows)
         if chart:

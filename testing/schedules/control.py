@@ -35,7 +35,7 @@ from .numbered import NumberedFuture, NumberedTask
 from .places import SimulatedPlace, inside, is_dead, never, no_more, place_of
 from .reduction.stepped import Stepped
 from .reduction.telling import TellingFuture, TellingTask
-from .reduction.watch import Watch
+from .reduction.watch import StepWatch
 from .world import EPOCH
 
 if TYPE_CHECKING:
@@ -183,7 +183,7 @@ class ControlledLoop(VirtualClockLoop):
     def call_at(
         self, when: float, callback: Callable[[*Ts], object], *args: *Ts, context: Context | None = None
     ) -> asyncio.TimerHandle:
-        """As every loop."""
+        """As every loop; the watch of the steps, if there is one, notes the timer."""
         handle = super().call_at(when, callback, *args, context=context)
         if self.due.watch is not None:
             self.due.watch.set_timer(handle)
@@ -362,9 +362,9 @@ class Control:
         self._in_a_row = 0  # turns of that one
         self._nodes: dict[object, DrawnCells] = {}
         self._drained: DrawnCells | None = None  # where a turn was begun, after which nothing has been chosen yet
-        self.watch: Watch | None = None
+        self.watch: StepWatch | None = None
         if isinstance(choices, Stepped) and node is not None:
-            self.watch = loop.due.watch = choices.watch = Watch(choices, node)
+            self.watch = loop.due.watch = choices.watch = StepWatch(choices, node)
             self._due.is_told = True
         self._swaps = Swaps()
         if self.watch is not None:

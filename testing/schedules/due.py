@@ -17,7 +17,7 @@ from ...checkpoint.life.outcome_order import OutcomeOrder
 from .places import is_dead, lane_of
 
 if TYPE_CHECKING:
-    from .reduction.watch import Watch
+    from .reduction.watch import StepWatch
 
 Option = tuple[Hashable, asyncio.Handle, bool]
 """Whose step it is (a node, a task, a timer, or the lane of other callbacks), what is called, and whether its place
@@ -74,7 +74,7 @@ class DueQueue:
 
     def __init__(self) -> None:
         self.chooser: Chooser | None = None
-        self.watch: Watch | None = None
+        self.watch: StepWatch | None = None
         self.is_told = False
         self.has_dead = self.has_cancelled = False
         self.nodes = 0

@@ -20,7 +20,7 @@ from typing import Final, Literal, Protocol, get_args
 
 from ...actors.errors import SpecError
 from .choices import TURN, Choices, Keys, Production, Replay, Taken, Walk
-from .reduction.bounded import Bounded
+from .reduction.bounded import HoldBound
 from .reduction.search import Exhaustive
 
 Name = Literal["mixed", "random", "pct", "exhaustive", "coverage"]
@@ -95,7 +95,7 @@ def strategy(name: str, depth: int = DEPTH, holds: int | None = None) -> Strateg
         case "pct":
             return Pct(depth)
         case "exhaustive":
-            return Exhaustive() if holds is None else Bounded(holds)
+            return Exhaustive() if holds is None else HoldBound(holds)
         case "coverage":
             return CoverageGuided()
         case _:

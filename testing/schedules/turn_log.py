@@ -79,7 +79,7 @@ class HandledValues:
         self._encode = msgspec.msgpack.Encoder(enc_hook=_special).encode
 
     def turn(self, cell: Cell, item: Any, what: str) -> None:
-        """A turn begins."""
+        """Note the message of a turn that begins."""
         fields: tuple[str, ...] = ()
         body = b""
         value = item.message if isinstance(item, Item) else item

@@ -268,7 +268,7 @@ CHECKS = {
     ),
     "a life that is to end hears who is between two lives": Check(
         "checkpoint/life/recorded_life.py",
-        "        self.port.to_home(Leaving())\n",
+        "        self.port.to_home(LeavesTurn())\n",
         "",
         RUNTIME,
         "already and process",

@@ -91,7 +91,7 @@ CHECKS = {
         "whatever_it_prints",
     ),
     "whoever was late himself has heard no silence": Check(
-        "supervision/services/silence.py",
+        "supervision/services/silent_programs.py",
         "        now = self._clock.tick(self._loop.time())\n",
         "        now = self._clock.tick(self._loop.time()) + self._clock.lag\n",
         SILENT,

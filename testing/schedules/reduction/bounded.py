@@ -18,7 +18,7 @@ Holds = tuple[tuple[int, int], ...]
 """At which choices how many of those in front are held up, in order."""
 
 
-class Held(RepeatHolds):
+class HeldSchedule(RepeatHolds):
     """A run in which these are held up, and nobody else.
 
     Attributes:
@@ -47,7 +47,7 @@ class Held(RepeatHolds):
                 yield tuple({**ranks, choice: rank + 1}.items())
 
 
-class Bounded:
+class HoldBound:
     """One number of holds after the other, up to `most`."""
 
     def __init__(self, most: int) -> None:
@@ -57,10 +57,10 @@ class Bounded:
         self._is_over = False
 
     def choices(self, seed: int) -> Choices | None:
-        return None if self._is_over else Held(self._present[0])
+        return None if self._is_over else HeldSchedule(self._present[0])
 
     def learn(self, choices: Choices, trace: Sequence[tuple[str, str]]) -> None:
-        assert isinstance(choices, Held)
+        assert isinstance(choices, HeldSchedule)
         self._present.popleft()
         if self._holds < self._most:
             self._next += choices.more()

@@ -34,7 +34,7 @@ class Footprint(NamedTuple):
 NOTHING: Final = Footprint()
 
 
-class Step(NamedTuple):
+class NotedStep(NamedTuple):
     """One step of a run.
 
     Attributes:
@@ -72,12 +72,12 @@ class _Accesses:
         self.readers: list[int] = []
 
 
-def races(steps: list[Step], begin: int = 0) -> Iterator[Race]:
+def races(steps: list[NotedStep], begin: int = 0) -> Iterator[Race]:
     """All pairs of steps that meet, with nothing between them that orders them; the second one from `begin` on.
 
     Source: source sets: Abdulla, Aronis, Jonsson, Sagonas, POPL 2014.
 
-    >>> one, other = (Step(owner, Footprint(writes=frozenset({"x"}))) for owner in "pq")
+    >>> one, other = (NotedStep(owner, Footprint(writes=frozenset({"x"}))) for owner in "pq")
     >>> list(races([one, other]))
     [Race(first=0, second=1, initials=frozenset({'q'}))]
     """
@@ -120,7 +120,7 @@ def _note(number: int, footprint: Footprint, accesses: dict[Token, _Accesses]) -
         accesses.setdefault(token, _Accesses()).readers.append(number)
 
 
-def _initials(steps: list[Step], before: list[int], first: int, second: int, ordered: int) -> frozenset[Hashable]:
+def _initials(steps: list[NotedStep], before: list[int], first: int, second: int, ordered: int) -> frozenset[Hashable]:
     """Whose step may come first among those that need not come behind the first of the two."""
     found: set[Hashable] = set()
     rest = 0  # those between the two that do not depend on the first

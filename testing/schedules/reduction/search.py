@@ -18,7 +18,7 @@ SEED: Final = 0
 """Of all schedules of a search: what is drawn must be the same where two of them begin alike."""
 
 
-class Point:
+class ChoicePoint:
     """A point of the search tree, from which one step was taken.
 
     Attributes:
@@ -52,7 +52,7 @@ class Exhaustive:
     """Depth first through all schedules."""
 
     def __init__(self) -> None:
-        self._path: list[Point] = []
+        self._path: list[ChoicePoint] = []
         self._is_over = False
 
     def choices(self, seed: int) -> Choices | None:
@@ -81,7 +81,7 @@ class Exhaustive:
 class Explored(Stepped):
     """One path of the search: repeated as far as it is known, then the first that does not sleep."""
 
-    def __init__(self, path: list[Point]) -> None:
+    def __init__(self, path: list[ChoicePoint]) -> None:
         super().__init__(SEED)
         self.known = len(path)
         self._path = path
@@ -102,7 +102,7 @@ class Explored(Stepped):
             asleep = self._asleep(number)
             if owner in asleep:  # All that could come now does so in another run.
                 return False
-            self._path.append(Point(options, asleep, owner))
+            self._path.append(ChoicePoint(options, asleep, owner))
         return True
 
     def _asleep(self, number: int) -> dict[Hashable, Footprint]:

@@ -7,10 +7,10 @@ from collections.abc import Callable, Hashable, Iterable
 from typing import TYPE_CHECKING, Any
 
 from ..choices import Choices, Keys
-from .footprints import EVERYTHING, NOTHING, Footprint, Step
+from .footprints import EVERYTHING, NOTHING, Footprint, NotedStep
 
 if TYPE_CHECKING:
-    from .watch import Watch
+    from .watch import StepWatch
 
 
 class Stepped(Choices):
@@ -25,8 +25,8 @@ class Stepped(Choices):
 
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
-        self.watch: Watch | None = None
-        self.noted: list[Step] = []
+        self.watch: StepWatch | None = None
+        self.noted: list[NotedStep] = []
         self.number = -1
         self.options: tuple[Hashable, ...] = ()  # who could have the coming step, if that is a choice
         self.is_over = self.has_ended = False
@@ -70,7 +70,7 @@ class Stepped(Choices):
             return
         self.number += 1
         self._ready.append(options)
-        self.noted.append(Step(owner, NOTHING))
+        self.noted.append(NotedStep(owner, NOTHING))
         self._touched, self._needs, self._since = touched, set(enabled_by), self._moment
 
     def admit(self, owner: Hashable, options: tuple[Hashable, ...]) -> bool:
@@ -101,9 +101,9 @@ class Stepped(Choices):
     def _close(self) -> None:
         if self.number >= 0 and not self.is_over:
             needs = frozenset(step for step in self._needs if 0 <= step < self.number)
-            self.noted[-1] = Step(self.noted[-1].owner, self._touched(), needs, self._since)
+            self.noted[-1] = NotedStep(self.noted[-1].owner, self._touched(), needs, self._since)
 
-    def steps_of_run(self) -> list[Step]:
+    def steps_of_run(self) -> list[NotedStep]:
         """The steps. Who schedules two callbacks of a lane says in which order they come: that matters if they meet."""
         steps = list(self.noted)
         for lane, callbacks in self._lanes.items():

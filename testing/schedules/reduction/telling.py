@@ -11,15 +11,15 @@ from ..numbered import NumberedFuture, NumberedTask
 T = TypeVar("T")
 
 
-class Listener(Protocol):
-    """Hears of them."""
+class AccessListener(Protocol):
+    """Hears what each step reads and changes, by tokens of what that is."""
 
     def read(self, token: Hashable) -> None:
         """Something was looked at in the present step."""
         ...
 
     def write(self, token: Hashable) -> None:
-        """Something was changed."""
+        """Note that the present step has changed something."""
         ...
 
 
@@ -29,7 +29,7 @@ class Telling:
     __slots__ = ()
 
     kind: ClassVar[str]
-    listener: Listener
+    listener: AccessListener
     number: int
 
     @property
@@ -92,6 +92,6 @@ class TellingTask(Telling, NumberedTask[T]):
 
     kind = "task"
 
-    def __init__(self, listener: Listener, number: int, *args: Any, **options: Any) -> None:
+    def __init__(self, listener: AccessListener, number: int, *args: Any, **options: Any) -> None:
         self.listener = listener
         super().__init__(number, *args, **options)

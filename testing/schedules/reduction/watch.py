@@ -41,7 +41,7 @@ WAKE_UPS = ("_set_result_unless_cancelled", "_release_waiter")
 """Timers of asyncio that end a wait, and do nothing else."""
 
 
-class Watch:
+class StepWatch:
     """Tells a search of each step of a run.
 
     Args:
@@ -80,7 +80,7 @@ class Watch:
             self._reads.add(token)
 
     def write(self, token: Hashable) -> None:
-        """Something was changed."""
+        """Note that the present step has changed something."""
         if not self._is_silent:
             self._writes.add(token)
             self._set[token] = self._number
@@ -181,7 +181,7 @@ class Watch:
             self._writes.add(("mailbox", cell.path))
 
     def callback(self, option: Option) -> None:
-        """A callback is called."""
+        """Begin the step of a callback that is called now."""
         key, handle, has_place = option
         context: Any = handle._context  # type: ignore[attr-defined]  # no stub has it
         made = self._made.pop(id(handle), -1)
@@ -271,7 +271,7 @@ class Watch:
     # -- the loop -----------------------------------------------------------------------------------------------------
 
     def made(self, key: Hashable, handle: asyncio.Handle, has_place: bool) -> None:
-        """A callback was scheduled."""
+        """Note by which step a callback was scheduled."""
         if type(handle) is not asyncio.TimerHandle:
             self._made[id(handle)] = self._number
         lane = self._lanes[lane_of(handle)]
@@ -284,7 +284,7 @@ class Watch:
                 self.read(("place", place))
 
     def set_timer(self, handle: asyncio.TimerHandle) -> None:
-        """A timer was set."""
+        """Note by which step a timer was set."""
         self._made[id(handle)] = self._number
 
     def time_passes(self) -> None:

@@ -42,7 +42,7 @@ class SilenceWatch:
         self._timer = loop.call_later(self._period, self._look)
 
     def heard(self) -> None:
-        """It has printed something."""
+        """Begin the silence anew: the program has printed something."""
         self._last, self._waited = self._clock.at(self._loop.time()), -1.0
 
     def _look(self) -> None:
@@ -60,5 +60,5 @@ class SilenceWatch:
         self._timer = self._loop.call_later(self._period, self._look)
 
     def close(self) -> None:
-        """Look no more."""
+        """Stop looking: the program is stopped, or has ended."""
         self._timer.cancel()
