@@ -444,9 +444,10 @@ class ReplicatedJournal:
         return Segment.of(number, blocks)
 
     def _blob(self, name: str) -> bytes | None:
-        """A large value, from memory if it is not sent yet.
+        """A large value, from memory if it is not sent yet; `None` if the log refers to it, and it is not there.
 
         Raises:
+            StaleEpoch: another leads: it removes what only this leader still refers to.
             StoreFailed: the engine does not answer.
         """
         with self._count_lock:
@@ -460,7 +461,11 @@ class ReplicatedJournal:
             return fetched
         try:
             # Again and again: at a takeover servers may be choosing a leader, and who cannot read cannot lead.
-            return self._loop.wait(insist(lambda: self._engine.blobs.get(name)), READ_SECONDS)
+            data = self._loop.wait(insist(lambda: self._engine.blobs.get(name)), READ_SECONDS)
+            if data is None:  # Once a look is written, nobody led before it who could have removed it.
+                self._queue(LogWrite())
+                self._loop.wait(self._written(), READ_SECONDS)
+            return data
         except TimeoutError as error:
             problem = f"no server has answered for {READ_SECONDS:g} s with a large snapshot; start the program again"
             raise StoreFailed(self.path, problem) from error

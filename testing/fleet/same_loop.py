@@ -40,8 +40,8 @@ class SameLoop:
         """Run a coroutine: at once if called on the loop, where it must not wait for anything.
 
         Raises:
-            WouldWait: it has to wait; what it has done until then stays done.
-            TimeoutError: it has taken longer in a thread, and was cancelled.
+            WouldWait: it has to wait, for as long as it takes; what it has done until then stays done.
+            TimeoutError: it has taken longer, and was cancelled; on the loop each wait takes longer than any time.
         """
         if threading.get_ident() != self._thread:
             running = asyncio.run_coroutine_threadsafe(work, self._loop)
@@ -56,6 +56,8 @@ class SameLoop:
             result: T = done.value
             return result
         work.close()
+        if seconds is not None:
+            raise TimeoutError
         raise WouldWait(repr(work))
 
     def run(self, work: Coroutine[Any, Any, T]) -> asyncio.Future[T]:

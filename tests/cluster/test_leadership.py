@@ -381,6 +381,26 @@ async def test_a_large_snapshot_is_asked_for_again_until_it_comes() -> None:
     await asyncio.to_thread(journal.close)
 
 
+async def test_who_is_deposed_takes_nothing_for_damaged(stage: Stage) -> None:
+    """Whoever leads since has removed a large snapshot that only the deposed leader refers to: nothing is damaged."""
+    first = await stage.leader("first")
+    first.journal.cut(A, b"x" * (1 << 20), [], turn=1)
+    await first.journal.synced()
+    first.engine.link.freeze()
+    stage.broker.expire_lease()
+    second = await stage.leader("second")
+    second.journal.erase(A)
+    await second.journal.synced()
+    while stage.broker.blobs:
+        await asyncio.sleep(0.01)
+    first.engine.link.thaw()
+    with pytest.raises(StoreFailed, match="with a large snapshot"):  # It has to wait until it knows whether it leads.
+        first.journal.load(A)
+    loading = asyncio.to_thread(first.journal.load, A)
+    with pytest.raises(StaleEpoch):
+        await loading
+
+
 async def test_who_has_waited_for_silent_servers_does_not_wait_once_more_at_the_end(stage: Stage) -> None:
     first = await stage.leader("first")
     loop = asyncio.get_running_loop()

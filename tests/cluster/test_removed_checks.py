@@ -69,6 +69,13 @@ CHECKS = {
         LEADERSHIP,
         "asked_for_again_until_it_comes",
     ),
+    "a large snapshot is missing only to whoever still leads": Check(
+        "cluster/replicated_journal.py",
+        "self._loop.wait(self._written(), READ_SECONDS)",
+        "pass",
+        LEADERSHIP,
+        "deposed_takes_nothing_for_damaged",
+    ),
     "a blob whose parts are late is not taken for one that is not there": Check(
         "cluster/nats/nats_engine.py",
         'raise Unanswered(self._name, f"{wanted - len(parts)} parts of {name} do not come") from error',

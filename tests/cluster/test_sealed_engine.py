@@ -114,7 +114,7 @@ async def test_what_stands_beside_the_log_is_bound_to_its_name() -> None:
     engine = await sealed(SimEngine(broker), KEY, "app")
     journal = ReplicatedJournal(engine, SameLoop(), await lead(engine, "the second", standby=None))
     with pytest.raises(DamagedStore, match="is missing"):
-        journal.load("/app/large")
+        await asyncio.to_thread(journal.load, "/app/large")
     await journal.end()
 
 
