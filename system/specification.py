@@ -2,7 +2,8 @@
 
 The program says what it starts below the root, and each such spec has a note here as soon as a transaction has made
 another one of it: of which the change was made, and what has become of it. The next root that starts that very spec
-starts the changed one. If the program has changed, its word is newer. Mechanisms have notes of their own
+starts the changed one, or nothing, if it was removed or lives below a supervisor now: then the note is an address, or
+"". If the program has changed, its word is newer. Mechanisms have notes of their own
 (`mechanism_notes.py`), for they are on trial at first; the specs here are as if those were still to be attached.
 """
 
@@ -75,6 +76,7 @@ class Specifications:
         self._packer = Packer()
         self._root, self._root_flags = "", Flags()  # as the program says
         self._order: list[str] = []  # of the children of the root, if that is not the one in which they are started
+        self._away: dict[str, str] = {}  # where those live now that were moved away from the root; "": removed
         self._added: set[str] = set()  # children of the root that no program has started
         self.brought: set[str] = set()
         """Those of them that were brought back; a program that starts one itself means another one."""
@@ -120,10 +122,50 @@ class Specifications:
             return declared
         return self._revived(address, data)
 
-    def started(self, address: str, declared: ChildSpec, wanted: ChildSpec, *, fresh: bool) -> None:
-        """What the program wanted is there: what is said of it from now on is a change."""
+    def elsewhere(self, address: str, declared: ChildSpec, *, fresh: bool) -> str | None:
+        """The address at which that lives which the program starts as `declared`, if it is a child of the root no more.
+
+        `None`: it is to be started. Where it was removed, nobody lives at the address that is returned.
+        """
+        digest, data = self._loaded.get(address, (None, b""))
+        if digest is None or fresh or digest != _digest(self._packed(declared)[0]):
+            return None
+        where = msgspec.msgpack.decode(data)
+        if not isinstance(where, str):
+            return None
+        del self._loaded[address]
+        self._declared[address], self._away[address] = declared, where
+        return where or address
+
+    def void_below(self, address: str) -> list[ChildSpec]:
+        """What was moved away from the root to below an address where the program says something else now.
+
+        It is there no more. Those that the program has started are returned, to be started where it says.
+        """
+        back: list[ChildSpec] = []
+        for one, where in [(one, where) for one, where in self._away.items() if is_at(where, address)]:
+            del self._away[one]
+            self._lapse(one)
+            back.append(self._declared[one])
+        for one, (digest, data) in list(self._loaded.items()):
+            where = msgspec.msgpack.decode(data) if digest is not None else None
+            if isinstance(where, str) and is_at(where, address):
+                del self._loaded[one]
+                self._lapse(one)
+        return back
+
+    def _lapse(self, address: str) -> None:
+        self._keep(address, None)
+        self._homes.node.emit(SpecificationSuperseded(address))
+
+    def started(self, address: str, declared: ChildSpec, wanted: ChildSpec, *, fresh: bool) -> list[ChildSpec]:
+        """What the program wanted is there: what is said of it from now on is a change.
+
+        Return what is to be started where the program says, for what it has started here is newer (`void_below`).
+        """
         is_newer = address in self._loaded and wanted is declared
         self._loaded.pop(address, None)
+        self._away.pop(address, None)
         self._added.discard(address)
         if self._is_kept:
             self._declared[address] = declared
@@ -132,9 +174,11 @@ class Specifications:
             self._keep(address, None)
         if is_newer and not fresh:
             self._homes.node.emit(SpecificationSuperseded(address))
+        back = self.void_below(address) if is_newer else []
         if self._is_kept:
             self._see(address)
         self._arrange()
+        return back
 
     def _forget_ended(self) -> None:
         """Forget children that have gone for good, now and then: a program may start others without end."""
@@ -214,7 +258,8 @@ class Specifications:
         if not self._is_kept:
             return
         tops = [one for one in root.children.values() if not one.is_leaving]
-        added = [one for one in tops if one.is_planned or one.has_moved or one.path in self._added]
+        come = [one for one in tops if one.is_planned or one.has_moved or one.path in self._added]
+        added = [one for one in come if one.is_planned or self._away.get(one.path) != one.path_before]  # not back
         by_path = {one.path: one for one in tops if one not in added}
         declared = [by_path[path] for path in self._declared if path in by_path]
         for one in (*declared, *added):
@@ -257,24 +302,29 @@ class Specifications:
                 if not below:
                     self._packed(spec)
 
-    def changed(self, added: set[str], removed: set[str], before: Mapping[str, Any]) -> None:
+    def changed(
+        self, added: set[str], removed: set[str], gone: Mapping[str, str], before: Mapping[str, Any]
+    ) -> None:
         """A transaction is in force: keep what it has made of the children of the root.
 
         Args:
             added: the children of the root that it has added or moved there.
             removed: those that it is about to stop.
+            gone: the new address of each that it has moved, by the one before, and "" for each that it has removed.
             before: which mechanisms the store says, or will say, that addresses have besides what is kept here.
         """
         if not self._is_kept:
             return
-        self._added |= added
         there = self._there()
+        for address, where in {**{one: one for one in gone if one in self._declared}, **self._away}.items():
+            self._away[address] = _now_at(where, gone)
+        self._added |= {one for one in added if self._away.get(one) != one}  # The others are back.
         for address in sorted({*self._added, *self._declared}):
             spec = there.get(address) if address not in removed else None
             if spec is None:
                 self._added.discard(address)
-                self._keep(address, None)
-            elif spec is not self._seen.get(address):
+                self._note_away(address)
+            elif self._away.pop(address, None) is not None or spec is not self._seen.get(address):
                 self._seen[address] = spec
                 self._note(address, spec, before)
         self._note_root(removed)
@@ -289,6 +339,18 @@ class Specifications:
             order = [name for name in supervisor._listed() if name in known or name in added]
             started = [name for name in known if name in order]
             self._keep_root(supervisor._flags, order if order != started else [])
+
+    def _note_away(self, address: str) -> None:
+        where = self._away.get(address)
+        if where is None:
+            self._keep(address, None)
+            return
+        was, why = self._packed(self._declared[address])
+        if why:
+            self._keep(address, None)
+            self._homes.node.emit(SpecificationNotKept(address, why))
+        else:
+            self._keep(address, msgspec.msgpack.encode((_digest(was), msgspec.msgpack.encode(where))))
 
     def _note(self, address: str, spec: ChildSpec, before: Mapping[str, Any]) -> None:
         declared = None if address in self._added else self._declared[address]
@@ -326,6 +388,23 @@ class Specifications:
             del self._kept[address]
         else:
             self._kept[address] = value
+
+
+def _now_at(address: str, gone: Mapping[str, str]) -> str:
+    """Where somebody lives who lived there, if these were moved or removed, with all that is below them.
+
+    >>> _now_at("/app/a/b/c", {"/app/a": "/app/x", "/app/a/b": "/app/b"})
+    '/app/b/c'
+    >>> _now_at("/app/a/b/c", {"/app/a": ""})
+    ''
+    """
+    top, rest = address, ""
+    while top and top not in gone:
+        top, _, name = top.rpartition("/")
+        rest = f"/{name}{rest}"
+    if not top:
+        return address
+    return gone[top] and gone[top] + rest
 
 
 def _refuse_of_scripts(top: DraftPlace) -> None:

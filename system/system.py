@@ -580,7 +580,8 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
     async def start(self, spec: ChildSpec[A], *, fresh: bool = False) -> ActorRef[A]:
         """Start a child of the root, and wait until it is up; None instead of a ref if it raised `Ignore`.
 
-        One that a transaction has stopped in an earlier program stays stopped, and the ref is that of its address. With
+        One that a transaction has stopped or removed in an earlier program stays so, and the ref is that of its
+        address; one that a transaction has moved lives where it was moved, and the ref is that of its new address. With
         `fresh` nothing comes back that was recorded at its address, or below it, before. While the root is
         suspended the start waits: the event `OrderHeld` says so after 5 seconds, and `resume` lets it go on.
 
@@ -594,12 +595,15 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
         if address in known.brought:  # The program says so itself now.
             known.brought.discard(address)
             await root.ask(RemoveChild(spec.id), LONG)
+        if (lives_at := known.elsewhere(address, spec, fresh=fresh)) is not None:
+            return self._node.ref_at(lives_at)
         wanted: ChildSpec = known.in_force(address, spec, fresh=fresh)
         with seldom_collected(), told_if_held(root._cell.living, "start", address):
             stays = not wanted.autostart and spec.autostart
             order = StartChild(wanted, fresh=fresh, unless_stopped=stays)
             ref = cast("ActorRef[A]", await root.ask(order, LONG))
-        known.started(address, spec, wanted, fresh=fresh)
+        for back in known.started(address, spec, wanted, fresh=fresh):
+            await root.ask(StartChild(back), LONG)
         await known.start_added(lambda one: root.ask(StartChild(one, unless_stopped=True), LONG))
         await self._homes.journal.safe()
         return self._node.ref_at(address) if stays else ref

@@ -108,6 +108,12 @@ class DraftPlace:
         return self.name if self.parent is None else f"{self.parent.path}/{self.name}"
 
     @property
+    def path_before(self) -> str:
+        """The address before the transaction; only of one who was there."""
+        below = self.was.below
+        return self.name if below is None else f"{below.path_before}/{self.name}"
+
+    @property
     def has_moved(self) -> bool:
         """Whether it is below another supervisor than before."""
         return not self.is_planned and self.parent is not self.was.below
@@ -517,6 +523,14 @@ class Draft:
         top = self.root.children.values()
         come = {one.path for one in top if one.is_planned or one.has_moved}
         return come, {one.path for one in top if one.is_leaving}
+
+    def gone(self) -> dict[str, str]:
+        """The new address of each that was moved, by the one before, and "" for each that was removed."""
+        return {
+            place.path_before: "" if place.is_leaving else place.path
+            for place in self.root.walk()
+            if not place.is_planned and (place.is_leaving or place.has_moved)
+        }
 
     def mechanisms(self) -> dict[str, Any]:
         """Which mechanisms those have, at this instant, that are to have others."""

@@ -190,7 +190,7 @@ class Transaction:
         """What the children of the root are from now on, for the next root."""
         assert self._draft is not None
         mechanisms = {**self._draft.mechanisms(), **system._mechanism_notes.declared()}
-        system._specifications.changed(*self._draft.below_root(), mechanisms)
+        system._specifications.changed(*self._draft.below_root(), self._draft.gone(), mechanisms)
 
     async def _release(self, begun: list[Operation]) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Let go of what was prepared, last one first; a cancellation waits until that is over."""

@@ -105,6 +105,7 @@ CHANGES: dict[str, Callable[[hf.system.Change], object]] = {
     "strategy of the root": lambda change: change.strategy("/app", "rest_for_one"),
     "order at the top": lambda change: change.reorder("/app", ["right", "left"]),
     "to the top": lambda change: change.move("/app/left/a", "/app"),
+    "from the top": lambda change: change.move("/app/right", "/app/left"),
     "much": much,
 }
 
@@ -241,6 +242,94 @@ async def test_a_program_that_says_something_else_is_newer(tmp_path: Path) -> No
         assert actor._flags.strategy == "one_for_all"
     async with program(tmp_path / "store", first=left(strategy="rest_for_one")) as system:
         assert system._node.find("/app/left/x") is None
+
+
+@pytest.mark.parametrize("is_recorded", [False, True])
+async def test_who_was_moved_away_from_the_root_lives_where_it_was_moved(tmp_path: Path, is_recorded: bool) -> None:
+    """What the program starts as before is that one, with its state, also when it was moved on, and back again."""
+    recovery = RECORDED if is_recorded else None
+    spec, store = counter("one", recovery=recovery), tmp_path / "store"
+    sub = hf.supervisor("sub")
+    count = 0
+
+    @asynccontextmanager
+    async def begun(where: str, first: Any = spec) -> AsyncGenerator[hf.ActorSystem]:
+        nonlocal count
+        async with program(store) as system:
+            await system.start(sub)
+            one = await system.start(first)
+            assert one.path == where
+            count = count + 1 if is_recorded else 1
+            assert await one.ask(Add(1)) == count
+            assert await ref(system, where).ask(Add(0)) == count
+            there = system._node.find("/app/one")  # It leads to where a recorded actor has gone.
+            assert there is None or there.path == where
+            yield system
+
+    async with begun("/app/one") as system, system.transaction(timeout=IN_TIME) as change:
+        change.move("/app/one", "/app/sub")
+    async with begun("/app/sub/one") as system, system.transaction(timeout=IN_TIME) as change:
+        change.move("/app/sub", "/app/right")
+    async with begun("/app/right/sub/one") as system:
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.move("/app/right/sub/one", "/app/left")
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.move("/app/left/one", "/app")
+        assert "/app/one" not in system._specifications._kept
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.move("/app/one", "/app/left")
+            change.move("/app/right/sub", "/app")
+    async with begun("/app/left/one"):
+        pass
+    if is_recorded:
+        return
+    async with begun("/app/one", first=counter("one", recovery=recovery, shutdown=3.0)) as system:  # It is newer.
+        assert system._node.find("/app/left/one") is not None
+
+
+async def test_who_was_removed_by_a_transaction_stays_so_until_somebody_says_otherwise(tmp_path: Path) -> None:
+    store, one = tmp_path / "store", counter("one", recovery=RECORDED)
+    async with program(store) as system:
+        await (await system.start(one)).ask(Add(3))
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.remove("/app/one")
+    async with program(store) as system:
+        gone = await system.start(one)
+        with pytest.raises(hf.ActorStopped):
+            await gone.ask(Add(1))
+        async with system.transaction(timeout=IN_TIME) as change:  # It is nothing to this one.
+            change.intensity("/app/left", 77, 7.0)
+    async with program(store) as system:
+        gone = await system.start(one)
+        with pytest.raises(hf.ActorStopped):
+            await gone.ask(Add(1))
+        assert await (await system.start(one)).ask(Add(1)) == 4  # In one life of the root the program is at its word.
+    async with program(store) as system:
+        assert await (await system.start(one)).ask(Add(1)) == 5
+
+
+@pytest.mark.parametrize("is_first", [False, True])
+async def test_who_was_moved_below_what_the_program_has_changed_is_where_the_program_says(
+    tmp_path: Path, is_first: bool
+) -> None:
+    store, one = tmp_path / "store", counter("one")
+    async with program(store) as system:
+        await system.start(one)
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.move("/app/one", "/app/left")
+    async with hf.ActorSystem("app", store=f"sqlite:{store}", log=False) as system:
+        with system.events() as stream:
+            if is_first:
+                assert (await system.start(one)).path == "/app/left/one"
+            await system.start(left(strategy="rest_for_one"))
+            if not is_first:
+                assert (await system.start(one)).path == "/app/one"
+            superseded = [event.address for event in stream.take() if isinstance(event, SpecificationSuperseded)]
+        assert sorted(superseded) == ["/app/left", "/app/one"]
+        assert await ref(system, "/app/one").ask(Add(1)) == 1
+        assert system._node.find("/app/left/one") is None
+    async with program(store, first=left(strategy="rest_for_one")) as system:
+        assert (await system.start(one)).path == "/app/one"
 
 
 @pytest.mark.parametrize("what", ["move", "add", "rise"])

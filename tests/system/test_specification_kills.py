@@ -31,6 +31,9 @@ SEED = int(os.environ.get("HOLDFAST_SEED", "1"))
 LONGEST = 0.4
 """Seconds that a root lives at most once it changes its tree."""
 TOPS = ("/app/left", "/app/right")
+"""They stay where they are; two more children of the root may go anywhere."""
+OURS = "rst"
+"""The recorded actors that the program has from the beginning."""
 
 
 @asynccontextmanager
@@ -41,6 +44,8 @@ async def program(store: str) -> AsyncGenerator[hf.ActorSystem]:
         below = hf.supervisor("sub", intensity=9, children=[counter("x"), counter("y")])
         await system.start(hf.supervisor("left", children=[counter("a"), counter("r", recovery=recorded), below]))
         await system.start(hf.supervisor("right", children=[counter("b"), client, counter("s", recovery=recorded)]))
+        await system.start(counter("t", recovery=recorded))
+        await system.start(hf.supervisor("low", children=[counter("u")]))
         yield system
 
 
@@ -51,15 +56,13 @@ def lines(system: hf.ActorSystem) -> list[str]:
 
 def ours(tree: list[str]) -> list[str]:
     """Without what the system itself has, which comes with the first recorded actor."""
-    return [line for line in tree if line.startswith(TOPS)]
+    return [line for line in tree if line.startswith("/app/") and not line.startswith("/app/recovery")]
 
 
 def draw(dice: random.Random, change: hf.system.Change, tree: list[str], number: int) -> None:
     """One random step."""
     paths = [line.partition(":")[0] for line in tree]
-    supervisors = [
-        path for path, line in zip(paths, tree, strict=True) if ": Supervisor" in line and path.startswith(TOPS)
-    ]
+    supervisors = ["/app", *(path for path, line in zip(paths, tree, strict=True) if ": Supervisor" in line)]
     others = [path for path in paths if path not in TOPS]
     above, one = dice.choice(supervisors), dice.choice(others)
     names = [path.rpartition("/")[2] for path in others if path.rpartition("/")[0] == above]
@@ -69,8 +72,8 @@ def draw(dice: random.Random, change: hf.system.Change, tree: list[str], number:
         case 1:
             change.add(above, hf.supervisor(f"t{number}", children=[counter("z")]))
         case 2:
-            if not any(path.rpartition("/")[2] in ("r", "s") for path in paths if f"{path}/".startswith(f"{one}/")):
-                change.remove(one)  # The two stay: what is acknowledged at them is looked at.
+            if not any(path.rpartition("/")[2] in OURS for path in paths if f"{path}/".startswith(f"{one}/")):
+                change.remove(one)  # These stay: what is acknowledged at them is looked at.
         case 3:
             change.move(one, above)
         case 4:
@@ -122,9 +125,9 @@ async def changing(store: str, log: str, seed: int) -> None:
 
 
 def recorded(system: hf.ActorSystem) -> list[str]:
-    """The addresses of the two recorded actors that the program has from the beginning, if they are still there."""
+    """The addresses of the recorded actors that the program has from the beginning, if they are still there."""
     paths = [line.partition(":")[0] for line in lines(system)]
-    return [path for path in paths if path.rpartition("/")[2] in ("r", "s")]
+    return [path for path in paths if path.rpartition("/")[2] in OURS]
 
 
 PROGRAM = """
