@@ -143,13 +143,13 @@ class Specifications:
         It is there no more. Those that the program has started are returned, to be started where it says.
         """
         back: list[ChildSpec] = []
-        for one, where in [(one, where) for one, where in self._away.items() if is_at(where, address)]:
+        for one in [one for one, where in self._away.items() if is_at(where, address)]:
             del self._away[one]
             self._lapse(one)
             back.append(self._declared[one])
         for one, (digest, data) in list(self._loaded.items()):
-            where = msgspec.msgpack.decode(data) if digest is not None else None
-            if isinstance(where, str) and is_at(where, address):
+            noted = msgspec.msgpack.decode(data) if digest is not None else None
+            if isinstance(noted, str) and is_at(noted, address):
                 del self._loaded[one]
                 self._lapse(one)
         return back
@@ -258,8 +258,8 @@ class Specifications:
         if not self._is_kept:
             return
         tops = [one for one in root.children.values() if not one.is_leaving]
-        come = [one for one in tops if one.is_planned or one.has_moved or one.path in self._added]
-        added = [one for one in come if one.is_planned or self._away.get(one.path) != one.path_before]  # not back
+        new = [one for one in tops if one.is_planned or one.has_moved or one.path in self._added]
+        added = [one for one in new if one.is_planned or self._away.get(one.path) != one.path_before]  # not back
         by_path = {one.path: one for one in tops if one not in added}
         declared = [by_path[path] for path in self._declared if path in by_path]
         for one in (*declared, *added):
@@ -302,9 +302,7 @@ class Specifications:
                 if not below:
                     self._packed(spec)
 
-    def changed(
-        self, added: set[str], removed: set[str], gone: Mapping[str, str], before: Mapping[str, Any]
-    ) -> None:
+    def changed(self, added: set[str], removed: set[str], gone: Mapping[str, str], before: Mapping[str, Any]) -> None:
         """A transaction is in force: keep what it has made of the children of the root.
 
         Args:
