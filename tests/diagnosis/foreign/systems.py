@@ -41,6 +41,8 @@ class Faults:
     refusals: float = 0.0
     """The part of what they are asked that services refuse, which is no fault."""
     rng: random.Random = dataclasses.field(default_factory=lambda: random.Random(1))
+    is_spreading: bool = False
+    """Whether also those fail whose asks do, who bear it else."""
     came_out: Callable[[str], None] = lambda name: None
     """Called with the name of each who takes what the system makes, whenever it has taken something."""
 
@@ -213,7 +215,8 @@ class Patient(Stage):
         try:
             await super().take(message)
         except hf.AskTimeout:
-            return
+            if self._faults.is_spreading:
+                raise
 
 
 class Service(Part):

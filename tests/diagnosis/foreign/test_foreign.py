@@ -10,7 +10,7 @@ import pytest
 
 from tests.diagnosis.foreign.repairs import ALL_TRIALS, LONGER, off_and_on
 from tests.diagnosis.foreign.systems import SYSTEMS, Foreign
-from tests.diagnosis.foreign.trials import TRAFFICS, Outcome, run, trial
+from tests.diagnosis.foreign.trials import TRAFFICS, Mode, Outcome, run, trial
 
 VIRTUAL = pytest.mark.asyncio(loop_factories=["virtual"])
 
@@ -57,6 +57,16 @@ async def test_the_root_cause_is_named_first(number: int) -> None:
 
 
 @VIRTUAL
+@pytest.mark.parametrize("number", range(2))
+@pytest.mark.parametrize("mode", ["intermittent", "cascading"])
+async def test_the_root_cause_of_what_comes_and_goes_and_of_what_spreads(mode: Mode, number: int) -> None:
+    foreign, fault, kind = random.Random(number).choice(ALL)
+    print(f"{foreign.name}: {fault}, {kind} traffic, seed {number}")
+    said = await trial(foreign, dict([fault]), kind, number, mode=mode)
+    assert (said.false_alarms, said.first) == ((), (fault[0],))
+
+
+@VIRTUAL
 async def test_who_is_slower_than_before_and_keeps_up_is_no_fault() -> None:
     (foreign,) = (one for one in SYSTEMS if one.name == "matching")
     said = await trial(foreign, {"report": "lag"}, "quiet", 1)
@@ -99,14 +109,15 @@ def test_of_many_pairs_of_faults_most_are_named() -> None:
     assert both >= 0.85 * 20 * TRIALS
 
 
-def test_of_many_faults_nearly_all_are_named() -> None:
+@pytest.mark.parametrize("mode", ["lasting", "intermittent", "cascading"])
+def test_of_many_faults_nearly_all_are_named(mode: Mode) -> None:
     if not TRIALS:
         pytest.skip("the campaign sets HOLDFAST_FOREIGN, and has the time for it")
     wrong: list[tuple[str, tuple[str, str], str, int, Outcome]] = []
     outcomes: list[Outcome] = []
     for seed in range(TRIALS):
         for foreign, fault, kind in ALL:
-            said = run(foreign, dict([fault]), kind, seed)
+            said = run(foreign, dict([fault]), kind, seed, mode=mode)
             outcomes.append(said)
             if said.first != (fault[0],) or said.false_alarms:
                 wrong.append((foreign.name, fault, kind, seed, said))

@@ -5,7 +5,7 @@ import contextlib
 import dataclasses
 import random
 from collections.abc import AsyncGenerator, Collection, Coroutine
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import holdfast as hf
 from holdfast import diagnosis
@@ -23,6 +23,10 @@ CHANGED = 20.0
 """Seconds of the changed traffic before the fault."""
 WITHIN = 30.0
 """Seconds in which a fault is to be named."""
+COMES, GOES = (4.0, 10.0), (2.0, 6.0)
+"""Seconds for which a fault that comes and goes is there, and is not, at least and at most."""
+Mode = Literal["lasting", "intermittent", "cascading"]
+"""What becomes of a fault: it stays, it comes and goes, or whoever asks the one with it fails, too."""
 JUMPS = 1_000_000_000
 """Jumps of the virtual clock in a run; a day takes about two million."""
 
@@ -98,15 +102,31 @@ def _names(components: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(name.rpartition("/")[2] for name in components)
 
 
+async def _come_and_go(faults: Faults, struck: dict[str, str], rng: random.Random) -> None:
+    while True:
+        await asyncio.sleep(rng.uniform(*COMES))
+        for name in struck:
+            faults.of.pop(name, None)
+        await asyncio.sleep(rng.uniform(*GOES))
+        faults.of |= struck
+
+
 async def trial(
-    foreign: Foreign, struck: dict[str, str], kind: str, seed: int, healthy: float = 0.0, refusals: float = 0.0
+    foreign: Foreign,
+    struck: dict[str, str],
+    kind: str,
+    seed: int,
+    healthy: float = 0.0,
+    refusals: float = 0.0,
+    mode: Mode = "lasting",
 ) -> Outcome:
     """Let a system run, change its traffic, and strike it; it is looked at `healthy` seconds longer before that.
 
     `struck`: what is wrong with whom then, all at once; with nobody the trial ends before.
     `refusals`: the part of what they are asked that services refuse as usual.
+    `mode`: what becomes of the faults; of one that comes and goes only one at a time.
     """
-    faults = Faults(refusals=refusals, rng=random.Random(seed))
+    faults = Faults(refusals=refusals, rng=random.Random(seed), is_spreading=mode == "cascading")
     said: list[tuple[float, Diagnosis]] = []
     loop = asyncio.get_running_loop()
     async with under_traffic(foreign, faults, kind, seed) as system:
@@ -119,12 +139,19 @@ async def trial(
         said.clear()
         began = loop.time()
         faults.of |= struck
+        changing = (
+            asyncio.create_task(_come_and_go(faults, struck, random.Random(f"{seed} {struck}")))
+            if mode == "intermittent"
+            else None
+        )
         found = set[str]()
         for _ in struck:
             if named := await _named(said, loop.time() + WITHIN, struck.keys() - found):
                 found |= named
                 if found != struck.keys():
                     await _mend(system, faults, named)
+        if changing is not None:
+            changing.cancel()
         if not said:
             return Outcome(false_alarms)
         at, first = said[0]
@@ -152,7 +179,13 @@ def in_its_own_loop(trial: Coroutine[Any, Any, T]) -> T:
 
 
 def run(
-    foreign: Foreign, struck: dict[str, str], kind: str, seed: int, healthy: float = 0.0, refusals: float = 0.0
+    foreign: Foreign,
+    struck: dict[str, str],
+    kind: str,
+    seed: int,
+    healthy: float = 0.0,
+    refusals: float = 0.0,
+    mode: Mode = "lasting",
 ) -> Outcome:
     """Run one trial in a loop of its own, for as long as it takes."""
-    return in_its_own_loop(trial(foreign, struck, kind, seed, healthy, refusals))
+    return in_its_own_loop(trial(foreign, struck, kind, seed, healthy, refusals, mode))
