@@ -163,14 +163,14 @@ TOKENS = 1 << 16
 DIGITS = string.digits + string.ascii_lowercase
 
 
-def _written(number: int) -> str:
+def written(number: int) -> str:
     """A number as few digits and letters; of equally many, the larger number sorts later.
 
-    >>> _written(35), _written(36)
+    >>> written(35), written(36)
     ('z', '10')
     """
     head, last = divmod(number, len(DIGITS))
-    return (_written(head) if head else "") + DIGITS[last]
+    return (written(head) if head else "") + DIGITS[last]
 
 
 class Numbers:
@@ -211,7 +211,7 @@ class Numbers:
     def begin_tokens(self, before: int, last: int = sys.maxsize) -> None:
         """Give out the fencing tokens that follow this one, up to the last one; made-up names bear a mark of it."""
         self._token, self._last_token = before, last
-        self._mark = _written(before // TOKENS)
+        self._mark = written(before // TOKENS)
 
 
 class Node(RunLoop):

@@ -135,7 +135,7 @@ CHECKS = {
     ),
     "a made-up name is none that an earlier program or process has made up": Check(
         "actors/kernel/node.py",
-        "        self._mark = _written(before // TOKENS)\n",
+        "        self._mark = written(before // TOKENS)\n",
         "",
         "tests/supervision/test_made_up_ids.py",
         "stranger and recorded",

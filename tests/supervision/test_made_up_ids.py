@@ -30,6 +30,9 @@ class Told(hf.Message[list[str]]): ...
 class Spawn(hf.Message[hf.ActorRef[hf.Actor]]): ...
 
 
+class Greet(hf.Message[list[str]]): ...
+
+
 class Session(hf.Actor):
     def __init__(self) -> None:
         self.connection: hf.ActorRef[hf.Actor] | None = None
@@ -70,9 +73,19 @@ class Connection(hf.Actor):
 class Bearer(hf.Actor):
     """Has connections below it that it gives no name."""
 
+    def __init__(self) -> None:
+        self.children: list[hf.ActorRef[Connection]] = []
+
     @hf.on(Spawn)
     def spawn(self, message: Spawn) -> hf.ActorRef[Any]:
         return self.ctx.spawn(hf.start(Connection))
+
+    @hf.on(Greet)
+    async def greet(self, message: Greet) -> list[str]:
+        self.children = [self.ctx.spawn(hf.start(Connection)) for _ in range(2)]
+        for number, child in enumerate(self.children):
+            child.tell(Line(f"number {number}"))
+        return [line for child in self.children for line in await child.ask(Told())]
 
 
 async def log_in(system: hf.ActorSystem, recovery: Any) -> list[hf.ActorRef[Session]]:
@@ -137,5 +150,21 @@ def test_a_ref_to_a_made_up_id_leads_to_no_stranger(end: str, kind: str, recover
         assert await late.ask(Told()) == [f"{anns.path} {hf.NOPROC}"]
         (down,) = await behind.ask(Told())
         assert down.startswith(anns.path)
+
+    run()
+
+
+@pytest.mark.parametrize("method", [hf.hybrid(), hf.replay_only()], ids=["hybrid", "replay_only"])
+def test_a_turn_that_is_replayed_makes_up_the_same_names(method: Any) -> None:
+    @simulate(seeds=SEEDS, store="simulated")
+    async def run(system: GuardedSystem, simulation: Simulation) -> None:
+        bearer = hf.child("bearer", hf.start(Bearer), recovery=method)
+        ref = await system.start(bearer)
+        assert await ref.ask(Greet()) == ["number 0", "number 1"]
+        system.expect_crashes()
+        ref.kill()
+        assert await ref.ask(Greet()) == ["number 0", "number 1"]
+        system = await simulation.crash_root()
+        assert await (await system.start(bearer)).ask(Greet()) == ["number 0", "number 1"]
 
     run()
