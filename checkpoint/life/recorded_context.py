@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
-import random
 from collections.abc import Awaitable, Callable, Generator
+from random import Random
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import msgspec
@@ -226,7 +226,7 @@ class RecordedContext(ActorContext):
 
     def __init__(self, cell: Cell) -> None:
         super().__init__(cell)
-        self._drawn, self._draws = -1, dict[str, random.Random]()  # of which turn, and what is drawn in it
+        self._drawn, self._draws = -1, dict[str, Random]()  # of which turn, and what is drawn in it
 
     def _continue_trace(self, tail: str) -> None:
         self.recorded.stage.trace = tail
@@ -263,10 +263,10 @@ class RecordedContext(ActorContext):
         return self._cell.node.clock.wall() if life.feed is None else max(life.feed.time, life.waits.moment)
 
     @property
-    def random(self) -> random.Random:
+    def random(self) -> Random:
         return self._draw()
 
-    def _draw(self, what: str = "") -> random.Random:
+    def _draw(self, what: str = "") -> Random:
         """The numbers of the turn in hand, which are the same each time it runs."""
         life = self.recorded
         if self._drawn != life.turn:
@@ -274,7 +274,7 @@ class RecordedContext(ActorContext):
         found = self._draws.get(what)
         if found is None:
             when = 0.0 if life.feed is None else life.feed.time
-            found = self._draws[what] = random.Random(f"{self.path}|{life.turn}|{when}{what}")
+            found = self._draws[what] = Random(f"{self.path}|{life.turn}|{when}{what}")
         return found
 
     def draw_anew(self) -> None:

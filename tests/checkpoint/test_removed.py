@@ -140,6 +140,13 @@ CHECKS = {
         "tests/supervision/test_made_up_ids.py",
         "stranger and recorded",
     ),
+    "a turn that is replayed makes up the same names": Check(
+        "checkpoint/life/recorded_context.py",
+        "        return super().spawn(start, name or self._made_up_name())\n",
+        "        return super().spawn(start, name)\n",
+        "tests/supervision/test_made_up_ids.py",
+        "replayed",
+    ),
     "a process makes up no name of its parent's": Check(
         "actors/kernel/node.py",
         "        self._token += 2 * TOKENS ",
