@@ -1,22 +1,21 @@
 """Who of an earlier program does not live again, as far as that is known: recorded actors may still be tied to them.
 
 A supervisor says, when it begins, which children it has or brings back. Whoever else was below it does not come by
-itself, and an id that it makes up from then on is somebody else's. Of an address whose supervisor has not begun, or
-which the program starts by itself, nothing is known; nor of one at which something is recorded, for whoever is started
-there goes on with that.
+itself, and an id that was made up is never made up again. Of an address whose supervisor has not begun, or which the
+program starts by itself, nothing is known; nor of one at which something is recorded, for whoever is started there goes
+on with that.
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ..actors.kernel.links import MADE_UP_NAME, is_anew
+from ..actors.kernel.links import MADE_UP_NAME
 from ..actors.persistence import CHILDREN
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
 
-    from ..actors.kernel.cell import Cell
     from ..actors.kernel.node import Node
     from .durable_links import DurableTies
 
@@ -69,16 +68,6 @@ class Absentees:
         """Whether something is recorded there for whoever comes; not if its supervisor has noted that nobody will."""
         noted = self._noted(f"{CHILDREN}{path}")
         return bool(noted) or (noted is None and self._has_recorded(path))
-
-    def is_another(self, cell: Cell) -> bool:
-        """Whether a living actor has its address by an id that was made up since its supervisor has begun."""
-        one: Cell | None = cell
-        while one is not None:
-            above = one.parent
-            if is_anew(one) and (above is None or one.name not in self._listed.get(above.path, ())):
-                return True
-            one = above
-        return False
 
     def wait(self, path: str, ties: DurableTies) -> None:
         """Ties to an address where nobody lives wait for somebody to come, or for the word that nobody will."""

@@ -31,7 +31,6 @@ class DurableTies:
         self._home = home
         self._kept: Counter[Tie] = Counter()
         self._untied: Counter[Tie] = Counter()  # as read back from the store
-        self._others: dict[str, Cell] = {}  # who lived at the other ends when they were untied in this program
         self._turn, self._before = -1, Counter[Tie]()  # the last turn that has changed them, and what there was then
 
     def turn(self, turn: int, verb: str, path: str) -> None:
@@ -56,7 +55,6 @@ class DurableTies:
         """Some of the others have moved: `now` gives their addresses."""
         if self._kept or self._untied:
             self._kept, self._untied = _renamed(self._kept, now), _renamed(self._untied, now)
-            self._others = {now(path): cell for path, cell in self._others.items()}
 
     def go_back(self, ties: list[Tie]) -> None:
         """These again, as a snapshot has them: what was tied since is undone, and what was untied comes back."""
@@ -68,7 +66,6 @@ class DurableTies:
             if cell is not None:
                 connect(cell, node.cell_at(path), undo[verb])
         self._untied = self._kept - stand
-        self._note_others()
 
     def saved(self, turn: int) -> list[Tie]:
         """All of them, as a snapshot of the state after a turn has them: what a later one does is in the journal."""
@@ -78,30 +75,22 @@ class DurableTies:
         """These, as a snapshot has them."""
         self._kept = Counter(ties)
 
-    def untie(self, *, is_read: bool = False) -> None:
+    def untie(self) -> None:
         """Nothing is tied until somebody lives here: it was read back from the store, or the address is free."""
         if not self._kept and not self._untied:
             return
         for _, path in self._kept:
             self._home.homes.addresses.absentees.over(path, self)
         self._untied = Counter(self._kept)
-        if not is_read:
-            self._note_others()
-
-    def _note_others(self) -> None:
-        node = self._home.node
-        others = {path: node.find(path) for _, path in self._untied}
-        self._others = {path: cell for path, cell in others.items() if cell is not None and not cell.is_dead}
 
     def tie(self) -> None:
         """The actor is live: tie what the last root had tied, now or when the other one is there.
 
-        Whoever does not come back, or whose id somebody else has now, has ended: the actor is told so.
+        Whoever does not come back has ended: the actor is told so.
         """
         if not self._untied:
             return
         untied, self._untied = self._untied, Counter()
-        others, self._others = self._others, {}
         node, absent = self._home.node, self._home.homes.addresses.absentees
         for verb, path in untied.elements():
             other = node.find(path)
@@ -111,8 +100,6 @@ class DurableTies:
                     continue
                 node.awaited.setdefault(path, []).append(functools.partial(self._tie_soon, verb, path))
                 absent.wait(path, self)
-            elif other is not others.get(path) and absent.is_another(other):
-                self._end(verb, path)
             else:
                 self._tie(verb, path)
 

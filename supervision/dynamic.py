@@ -42,7 +42,7 @@ from .respec import respec
 from .rules import Rule
 from .spec import NAMELESS, ChildSpec, Flags, Isolation, Plan, Restart, Shutdown, check_spec, child
 from .supervisor import Supervisor, listed_at
-from .supervisor_changes import Bequest, check_place, check_subtree, has_stood_down
+from .supervisor_changes import check_place, check_subtree, has_stood_down
 
 MADE_UP = b""
 """What is noted of a child whose id nobody knows when its supervisor is started again."""
@@ -56,14 +56,11 @@ class DynamicSupervisor(Supervisor):
 
     _is_dynamic: ClassVar[bool] = True
 
-    _count: int
-
     def __init__(self, flags: Flags | None = None, template: ChildSpec | None = None) -> None:
         self._given = Plan.of(flags or Flags(), () if template is None else (template,))
 
     def _begin(self, plan: Plan) -> None:
         check_dynamic(type_name(type(self)), plan)
-        self._count = 0
         plan = self._in_force(plan)
         super()._begin(Plan.of(plan.flags, ()))
         self._template = plan.children[0] if plan.children else None
@@ -256,13 +253,6 @@ class DynamicSupervisor(Supervisor):
         if is_lost:
             self._errand(self._lose(one.spec.id))
 
-    def _bequest(self) -> Bequest:
-        return {"count": self._count}
-
-    def _inherit(self, left: Bequest) -> None:
-        count = left.get("count")
-        self._count = count if isinstance(count, int) else 0
-
     def _keep_noted(self, one: Child, spec: ChildSpec, changed: tuple[str, ...] | None) -> None:
         self._try_to_note(one, lambda: self._note(one, self._first_noted(spec, changed)))
 
@@ -332,18 +322,12 @@ class DynamicSupervisor(Supervisor):
         if spec.id != NAMELESS and (self._template is None or message.candidate):
             return spec
         # Without a journal nobody knows this id when we have been restarted: what waits for it waits for nobody.
-        return dataclasses.replace(spec, id=self._new_id(spec), comes_back=self._flags.journal, made_up=True)
+        name = own.node.numbers.next_name(f"{self._beginning(spec)}-")
+        return dataclasses.replace(spec, id=name, comes_back=self._flags.journal, made_up=True)
 
-    def _new_id(self, spec: ChildSpec) -> str:
-        """An id that nobody has here: the template's or the class's name, and a number."""
-        prefix = spec.start.kind.__name__.lower() if spec.id == NAMELESS else spec.id
-        while True:
-            self._count += 1
-            name = f"{prefix}-{self._count}"
-            # Whoever had it once may be recorded, and is not to come back as somebody else.
-            is_known = self.ctx._cell.node.ports.keeper.has_recorded(f"{self.ctx.path}/{name}")
-            if not is_known and name not in self._children and name not in (self.ctx._cell.children or ()):
-                return name
+    def _beginning(self, spec: ChildSpec) -> str:
+        """What a made-up id begins with: the template's or the class's name."""
+        return spec.start.kind.__name__.lower() if spec.id == NAMELESS else spec.id
 
     async def _check_free(self, spec: ChildSpec) -> None:
         known = await self._come_so_far(spec.id)

@@ -63,21 +63,13 @@ class LifeMonitor(Monitor):
 class Ties:
     """What binds the actors of an address to others: links, who watches them, and whom they watch or have ordered."""
 
-    __slots__ = ("is_anew", "links", "monitors", "ordered", "watching")
+    __slots__ = ("links", "monitors", "ordered", "watching")
 
     def __init__(self) -> None:
         self.links: dict[Cell, str] = {}  # and the address that each is known by here, also if it has moved
         self.monitors: list[LifeMonitor] = []
         self.watching: dict[LifeMonitor, None] = {}
         self.ordered: dict[str, None] = {}  # addresses to which it has given orders
-        self.is_anew = False  # its id was made up in this program, as the process says that it lives in
-
-
-def is_anew(cell: Cell) -> bool:
-    """Whether the id of an actor was made up, so that in an earlier program it may have been somebody else's."""
-    spec, more = cell.spec, cell.more
-    made_up = spec.made_up if spec is not None else cell.name.startswith(MADE_UP_NAME)
-    return made_up or (more is not None and more.has_more and more.ties.is_anew)
 
 
 def monitor(watcher: Cell, target: Cell, *, for_good: bool, name: str = "") -> LifeMonitor:

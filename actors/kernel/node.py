@@ -6,6 +6,7 @@ import asyncio
 import dataclasses
 import itertools
 import random
+import string
 import sys
 import time
 import weakref
@@ -159,6 +160,18 @@ class Clock:
 TOKENS = 1 << 16
 """Fencing tokens that the actors of one process may use up; they keep the last one then."""
 
+DIGITS = string.digits + string.ascii_lowercase
+
+
+def written(number: int) -> str:
+    """A number as few digits and letters; of equally many, the larger number sorts later.
+
+    >>> written(35), written(36)
+    ('z', '10')
+    """
+    head, last = divmod(number, len(DIGITS))
+    return (written(head) if head else "") + DIGITS[last]
+
 
 class Numbers:
     """What a node counts, and the numbers that it gives out."""
@@ -168,6 +181,7 @@ class Numbers:
         self._names = itertools.count(1)
         self._turns = itertools.count(1)
         self._token, self._last_token = 0, sys.maxsize
+        self._mark = ""
         self.dead_letters = 0
         self.late_replies = 0
         self.no_room: Counter[tuple[NoRoom, type[Actor] | None]] = Counter()
@@ -176,9 +190,9 @@ class Numbers:
         """A seed for an actor's random generator."""
         return self._seeds.getrandbits(64)
 
-    def next_name(self) -> str:
-        """A name for an actor that was given none."""
-        return f"{MADE_UP_NAME}{next(self._names)}"
+    def next_name(self, beginning: str = MADE_UP_NAME) -> str:
+        """A name for an actor that was given none; nobody has it again, in any process or later program."""
+        return f"{beginning}{self._mark}-{next(self._names)}"
 
     def next_turn(self) -> int:
         """A number for a turn that asks."""
@@ -191,13 +205,13 @@ class Numbers:
 
     def tokens_for_process(self) -> int:
         """Put fencing tokens aside for the actors of a process; returns the one before the first of them."""
-        before = self._token
-        self._token += TOKENS
-        return before
+        self._token += 2 * TOKENS  # Those that are left out keep its mark apart from that of its parent.
+        return self._token - TOKENS
 
     def begin_tokens(self, before: int, last: int = sys.maxsize) -> None:
-        """Give out the fencing tokens that follow this one, up to the last one."""
+        """Give out the fencing tokens that follow this one, up to the last one; made-up names bear a mark of it."""
         self._token, self._last_token = before, last
+        self._mark = written(before // TOKENS)
 
 
 class Node(RunLoop):

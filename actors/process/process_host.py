@@ -647,8 +647,6 @@ def _command(node: Node, worker: Worker, frame: frames.Command) -> None:
             data = frame.data
             bound, last = data.get("bindings", {}), unpack_exit(data["last"]) if "last" in data else KILLED
             worker.inner.born(cell, data["path"], data["kind"], data["life"], bound, last)
-            if data.get("anew"):
-                node.cell_at(data["path"]).extra().ties.is_anew = True
         case "gone":
             reason, with_parent = unpack_exit(frame.data.get("reason")), bool(frame.data.get("with_parent"))
             worker.inner.gone(frame.data["path"], reason, with_parent=with_parent)

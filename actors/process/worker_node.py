@@ -315,8 +315,6 @@ class Guest(Peer):
             bound = {port: target.path for port, target in cell.extra().bindings.items()}
             last = pack_exit(cell.extra().reason)  # how the life before it ended, if there was one
             born = {"path": path, "kind": message_name(kind), "life": cell.life, "bindings": bound, "last": last}
-            if links.is_anew(cell):
-                born["anew"] = True
             self.command(root, "born", born)
 
     def _on_event(self, event: Event) -> None:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
-import random
 from collections.abc import Awaitable, Callable, Generator
+from random import Random
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import msgspec
@@ -24,13 +24,14 @@ from ...actors.errors import (
     type_name,
 )
 from ...actors.exit_reasons import NORMAL, SHUTDOWN, ExitReason, pack_exit
-from ...actors.kernel.actor import Actor
+from ...actors.kernel.actor import Actor, Start
 from ...actors.kernel.bindings import note_order
 from ...actors.kernel.cell import Cell, Order
 from ...actors.kernel.context import NO_MESSAGE, ActorContext, StashError
 from ...actors.kernel.envelope import Ask, Item, ReplyHandle
-from ...actors.kernel.links import Monitor
+from ...actors.kernel.links import MADE_UP_NAME, Monitor
 from ...actors.kernel.message import Message, message_name, require_message
+from ...actors.kernel.node import written
 from ...actors.kernel.ref import ActorRef, current
 from ...actors.kernel.timers import Timer
 from ...actors.seconds import check_seconds
@@ -215,14 +216,17 @@ class Resting(Pending):
 class RecordedContext(ActorContext):
     """`self.ctx` of a recorded actor: what it does becomes an output of the turn in hand."""
 
-    __slots__ = ("_drawn", "recorded")
+    __slots__ = ("_drawn", "_draws", "recorded")
 
     _may_fail_fast = False
     _may_rest = True
     _marks_waits = True
 
     recorded: Life
-    _drawn: int  # the turn that `_random` belongs to
+
+    def __init__(self, cell: Cell) -> None:
+        super().__init__(cell)
+        self._drawn, self._draws = -1, dict[str, Random]()  # of which turn, and what is drawn in it
 
     def _continue_trace(self, tail: str) -> None:
         self.recorded.stage.trace = tail
@@ -259,17 +263,30 @@ class RecordedContext(ActorContext):
         return self._cell.node.clock.wall() if life.feed is None else max(life.feed.time, life.waits.moment)
 
     @property
-    def random(self) -> random.Random:
+    def random(self) -> Random:
+        return self._draw()
+
+    def _draw(self, what: str = "") -> Random:
+        """The numbers of the turn in hand, which are the same each time it runs."""
         life = self.recorded
-        if self._random is None or self._drawn != life.turn:
-            self._drawn = life.turn
+        if self._drawn != life.turn:
+            self._drawn, self._draws = life.turn, {}
+        found = self._draws.get(what)
+        if found is None:
             when = 0.0 if life.feed is None else life.feed.time
-            self._random = random.Random(f"{self.path}|{life.turn}|{when}")
-        return self._random
+            found = self._draws[what] = Random(f"{self.path}|{life.turn}|{when}{what}")
+        return found
 
     def draw_anew(self) -> None:
         """A turn is about to be run again: it draws the same numbers as the first time."""
-        self._random = None
+        self._draws = {}
+
+    def spawn(self, start: Start[A], name: str | None = None) -> ActorRef[A]:
+        return super().spawn(start, name or self._made_up_name())
+
+    def _made_up_name(self) -> str | None:
+        """A name for a child that was given none; a turn that is replayed makes up the same, and no other turn does."""
+        return f"{MADE_UP_NAME}{written(self._draw('names').getrandbits(64))}" if self._in_turn() else None
 
     def find(self, path: str, kind: type[A]) -> ActorRef[A]:
         """A ref to the address, whoever lives there: under replay somebody else, or nobody yet (T21)."""

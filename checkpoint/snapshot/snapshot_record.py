@@ -257,7 +257,7 @@ def load(home: Switch, planted: Journaled | None = None) -> None:
     for position, entry in saved.entries:
         _reload(home, position, entry, timers)
     home.ledger.read = home.ledger.next_id
-    home.ties.untie(is_read=True)
+    home.ties.untie()
     for key, (name, body, left, interval) in timers.items():
         home.timers.start(key, name, body, max(0.0, left), interval)
     home.shapes.kind = home.shapes.kind or kind_in(home)

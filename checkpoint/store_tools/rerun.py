@@ -119,7 +119,9 @@ class RerunContext(RecordedContext):
 
     def spawn(self, start: Start[A], name: str | None = None) -> ActorRef[A]:
         node = self._cell.node
-        return cast("ActorRef[A]", node.cell_at(f"{self.path}/{name or node.numbers.next_name()}").ref)
+        return cast(
+            "ActorRef[A]", node.cell_at(f"{self.path}/{name or self._made_up_name() or node.numbers.next_name()}").ref
+        )
 
 
 class RerunLife(Life):

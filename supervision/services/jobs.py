@@ -144,14 +144,8 @@ class TaskSupervisor(DynamicSupervisor):
         job = next(running, None)
         return super()._why_occupied() or ("" if job is None else f"its job {job!r} is not over")
 
-    def _new_id(self, spec: ChildSpec) -> str:
-        if not issubclass(spec.start.kind, JobActor):
-            return super()._new_id(spec)
-        while True:
-            self._count += 1
-            name = f"{spec.start.args[0]}-{self._count}"
-            if name not in self._children:
-                return name
+    def _beginning(self, spec: ChildSpec) -> str:
+        return spec.start.args[0] if issubclass(spec.start.kind, JobActor) else super()._beginning(spec)
 
     async def _come_up(self, one: Child) -> None:
         """A process takes long to come up: whoever asked has the job at once, and its queue waits for it."""

@@ -1,7 +1,7 @@
 """A program for `test_ties_to_the_gone.py`: STORE WATCHER KIND PLACE ORDER END; END is "killed", "stopped" or "told".
 
 The first ones tie a watcher to one of a KIND that lives in PLACE, and end. "told" begins again in that ORDER, has
-somebody else come to the same address if that can be, and crash, and prints what the watcher was told.
+somebody come, to the same address if that can be, and crash, and prints what the watcher was told.
 """
 
 from __future__ import annotations
@@ -128,6 +128,7 @@ async def main(store: str, isolation: str, kind: str, place: str, order: str, en
         if end != "told":
             assert one is not None
             await ref.ask(Tie([one.path]), IN_TIME)
+            print(json.dumps(one.path), flush=True)
             if end == "stopped":
                 await system.stop(ref)
                 return
@@ -152,7 +153,7 @@ async def main(store: str, isolation: str, kind: str, place: str, order: str, en
             async with asyncio.timeout(IN_TIME):
                 while not any("EXIT" in text for text in after):
                     after = await ref.ask(Told(), IN_TIME)
-        print(json.dumps([one.path, before, after]))
+        print(json.dumps([before, after]))
 
 
 if __name__ == "__main__":

@@ -133,12 +133,26 @@ CHECKS = {
         TO_THE_GONE,
         "told_of_once and watcher and task",
     ),
-    "a tie does not go over to whoever has the same id now": Check(
-        "checkpoint/durable_links.py",
-        "elif other is not others.get(path) and absent.is_another(other):",
-        "elif False:",
-        TO_THE_GONE,
-        "told_of_once and stranger and task",
+    "a made-up name is none that an earlier program or process has made up": Check(
+        "actors/kernel/node.py",
+        "        self._mark = written(before // TOKENS)\n",
+        "",
+        "tests/supervision/test_made_up_ids.py",
+        "stranger and recorded",
+    ),
+    "a turn that is replayed makes up the same names": Check(
+        "checkpoint/life/recorded_context.py",
+        "        return super().spawn(start, name or self._made_up_name())\n",
+        "        return super().spawn(start, name)\n",
+        "tests/supervision/test_made_up_ids.py",
+        "replayed",
+    ),
+    "a process makes up no name of its parent's": Check(
+        "actors/kernel/node.py",
+        "        self._token += 2 * TOKENS ",
+        "        self._token += TOKENS ",
+        "tests/migration/test_moved_supervisors.py",
+        "goes_with_its_template",
     ),
     "who goes on with what is recorded is waited for": Check(
         "checkpoint/absentees.py",
@@ -153,20 +167,6 @@ CHECKS = {
         "return not self._may_return(at)",
         TO_THE_GONE,
         "may_come_back and listed",
-    ),
-    "a child that its supervisor has brought back is the same one": Check(
-        "checkpoint/absentees.py",
-        "if is_anew(one) and (above is None or one.name not in self._listed.get(above.path, ())):",
-        "if is_anew(one):",
-        TO_THE_GONE,
-        "may_come_back and journaled and house",
-    ),
-    "a process says whose id is made up": Check(
-        "actors/process/process_host.py",
-        '                node.cell_at(data["path"]).extra().ties.is_anew = True\n',
-        "                pass\n",
-        TO_THE_GONE,
-        "told_of_once and stranger and made and process",
     ),
     "an order is an output of its turn": Check(
         "checkpoint/life/recorded_context.py",

@@ -25,7 +25,7 @@ def run(*arguments: object) -> Any:
     environment = {**os.environ, "PYTHONPATH": PATHS}
     ended = subprocess.run(command, capture_output=True, text=True, timeout=90, env=environment, check=False)
     assert ended.returncode == (-9 if arguments[-1] == "killed" else 0), ended.stderr
-    return json.loads(ended.stdout or "[]")
+    return json.loads(ended.stdout)
 
 
 @pytest.mark.parametrize("end", ["killed", "stopped"])
@@ -36,12 +36,12 @@ def run(*arguments: object) -> Any:
 def test_who_does_not_come_back_is_told_of_once(
     tmp_path: Path, isolation: str, kind: str, place: str, order: str, end: str
 ) -> None:
-    """`again`: the watcher ties itself anew in `on_recovered`. Who comes to the same address is another one."""
+    """`again`: the watcher ties itself anew in `on_recovered`. Who comes below the same supervisor is another one."""
     if kind == "given" and order == "stranger first":
         pytest.skip("an id that is given is the same one's")
     told = [tmp_path / "app.db", isolation, kind, place, order]
-    run(*told, end)
-    path, before, after = run(*told, "told")
+    path = run(*told, end)
+    before, after = run(*told, "told")
     noproc = [f"DOWN {path} no such actor", f"DOWN {path} no such actor", f"EXIT {path} no such actor"]
     assert sorted(before) == noproc
     assert sorted(after) == noproc
@@ -57,8 +57,8 @@ def test_who_may_come_back_is_waited_for(
 ) -> None:
     """One of a list that was not started yet, one that goes on with its records, one that its supervisor brings."""
     told = [tmp_path / "app.db", isolation, kind, place, order]
-    run(*told, end)
-    path, before, after = run(*told, "told")
+    path = run(*told, end)
+    before, after = run(*told, "told")
     assert before == []
     assert f"EXIT {path} RuntimeError: boom" in after
     assert not any("no such actor" in text for text in after)

@@ -274,13 +274,14 @@ class Hangs(hf.Actor):
 
 async def main():
     async with hf.ActorSystem("app", log=False) as system:
-        system.spawn(hf.start(Hangs)).tell(Go())
+        hangs = system.spawn(hf.start(Hangs))
+        hangs.tell(Go())
         jobs = hf.supervision.Tasks(await system.start(hf.supervision.tasks("jobs")))
         try:
             await jobs.run(threading.Event().wait, timeout=0.1)
         except hf.AskTimeout:
             await jobs.run(begun.wait)
-            system.ref("/app/$1", hf.Actor).kill()
+            hangs.kill()
 
 begun = threading.Event()
 if __name__ == "__main__":

@@ -68,8 +68,7 @@ async def main(store: str, life: str, place: Any) -> None:
             top = await system.start(many)
             asker = await system.start(asks)
             if life == "first":
-                await top.ask(hf.StartChild())
-                busy = system.ref("/app/many/busy-1", Busy)
+                busy = await top.ask(hf.StartChild())
                 await busy.send(Hold(str(marker)))
                 await busy.send(Ping())
                 await asker.send(AskIt(busy.path))

@@ -125,8 +125,9 @@ async def test_children_come_back_in_order_with_their_arguments_and_what_they_ha
         await top.ask(hf.StartChild(args=("Ann",), id="ann"))
         await bob.ask(Note("salve"))
         await restarted(system)
-        assert await ids(system) == ["pupil-1", "ann"]
-        assert await words(system, "pupil-1") == ["Bob of Rome", "salve"]
+        name = bob.path.rpartition("/")[2]
+        assert await ids(system) == [name, "ann"]
+        assert await words(system, name) == ["Bob of Rome", "salve"]
         assert await words(system, "ann") == ["Ann of nowhere"]
 
 
@@ -143,13 +144,14 @@ async def test_they_come_back_when_the_same_tree_is_started_from_the_same_store(
     async with running(store) as system:
         top = await system.start(school(isolation=isolation))
         await top.ask(hf.StartChild(hf.child("doer", hf.start(Doer), recovery=hf.hybrid())))
-        await top.ask(hf.StartChild(hf.start(Pupil, "Bob")))
+        bob = await top.ask(hf.StartChild(hf.start(Pupil, "Bob")))
         await system.ref("/app/school/doer", Doer).ask(Note("kept"))
     async with running(store) as system:
         await system.start(school(isolation=isolation))
-        assert await ids(system) == ["doer", "pupil-1"]
+        name = bob.path.rpartition("/")[2]
+        assert await ids(system) == ["doer", name]
         assert await words(system, "doer") == ["kept"]
-        assert await words(system, "pupil-1") == ["Bob of nowhere"]
+        assert await words(system, name) == ["Bob of nowhere"]
 
 
 async def test_who_has_ended_for_good_does_not_come_back(store: str | None, isolation: Any) -> None:

