@@ -170,6 +170,8 @@ class Judge:
         resources: Resources | None = None,
         price: Pricing = resource_price,
     ) -> None:
+        if not callable(price):
+            raise TypeError(f"price is a function, such as response_price of holdfast.ftm, and not {price!r}")
         self.settings = settings
         self.application = application
         self.resources = Resources() if resources is None else resources
