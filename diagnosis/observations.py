@@ -68,6 +68,14 @@ class Observed(msgspec.Struct, frozen=True):
         """Nothing is known: no repair may start from this."""
         return not (self.positive or self.negative or self.contradictions)
 
+    def has_gone(self, symptom: Literal) -> bool:
+        """Whether a symptom is seen to have gone; that nobody says anything of it any more is no cure."""
+        if (
+            symptom.positive
+        ):  # A trend gives way to another one: that it is not said any more is all that is to be seen.
+            return symptom not in self.positive
+        return symptom.atom in self.positive
+
     @classmethod
     def of(cls, literals: Iterable[Literal]) -> Observed:
         """From bare literals; an atom with both signs is a contradiction."""

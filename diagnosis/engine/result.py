@@ -62,9 +62,14 @@ class Diagnosis(Message):
     convicted: tuple[str, ...] = ()
     """Components that are faulty whatever else is: known even where `truncated` says that candidates are missing."""
     unknown: tuple[str, ...] = ()
-    """Components of whose work nothing is seen at the moment: that they are healthy is not said."""
+    """Components of whose work nothing is seen at the moment, or not what is expected of them, or that are `uncleared`:
+    that they are healthy is not said."""
     set_aside: tuple[str, ...] = ()
     """Sources of observations that are not believed, because they contradict several others that agree."""
+    uncleared: tuple[str, ...] = ()
+    """Those of `unknown` that were suspected by symptoms that nobody has seen to have gone, as in a grace."""
+    crashed_observers: dict[str, str] = msgspec.field(default_factory=dict)
+    """Observers that have crashed within the last minute, each with the reason: what they look at may not be seen."""
     since: dict[str, float] = msgspec.field(default_factory=dict)
     """Since when each suspect has been one without a break, in Unix seconds."""
     known_until: dict[str, float] = msgspec.field(default_factory=dict)
@@ -72,6 +77,10 @@ class Diagnosis(Message):
 
     def __str__(self) -> str:
         """In words: `faulty: ja, or jn`."""
+        crashed = (f"; observer {path} has crashed: {why}" for path, why in self.crashed_observers.items())
+        return "".join((self._found(), *crashed))
+
+    def _found(self) -> str:
         words = ", or ".join(" and ".join(one.bad) for one in self.candidates if one.bad)
         more = f", or others ({' and '.join(self.truncated)} ran out)" if self.truncated else ""
         if words:

@@ -9,8 +9,8 @@ from collections import deque
 from collections.abc import Collection
 from typing import Any, Final
 
-from ..literals import Literal, ok
-from .observer import Manner, Observer, atom_of
+from ..literals import Literal, atom_of, ok
+from .observer import Manner, Observer
 
 LEARNING: Final = 5
 """Windows from which a rate is learned that was not given."""

@@ -265,8 +265,8 @@ CHECKS = {
     ),
     "a missing replica is no fault of the actor": Check(
         "diagnosis/generate.py",
-        "Expectation(str(atom(name)), (replicas_of(name),))",
-        "Expectation(str(atom(name)), (name,))",
+        "made(str(atom(name)), (replicas_of(name),))",
+        "made(str(atom(name)), (name,))",
         REPLICAS,
         "life_after_life",
     ),
