@@ -79,7 +79,7 @@ class Literal(msgspec.Struct, frozen=True, order=True, array_like=True, cache_ha
 
 
 def ok(topic: str) -> Literal:
-    """What is published on `topic`, or a named property, is as it should be."""
+    """Make the atom that a topic, or anything else that has a name, is as it should be."""
     return Literal("ok", (topic,))
 
 

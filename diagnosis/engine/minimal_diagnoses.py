@@ -70,7 +70,7 @@ class Diagnoser:
     async def diagnose(
         self, observations: Observations, *, repaired: Collection[str] = (), seconds: float | None = None
     ) -> Diagnosis:
-        """As `diagnose_now`, in a thread: the event loop goes on meanwhile. A cancellation stops the search.
+        """Diagnose as `diagnose_now` does, in a thread: the event loop goes on. A cancellation stops the search.
 
         Raises:
             BadLiteral: an observation has a name that the model does not declare.
@@ -115,7 +115,7 @@ class Diagnoser:
         return observations
 
     def explain(self, observations: Observations, *, seconds: float = math.inf) -> Explanation:
-        """Why there is something to repair: minimal conflicts, and failures that follow from others.
+        """Explain why there is something to repair: minimal conflicts, and failures that follow from others.
 
         Args:
             observations: those of the diagnosis.
@@ -134,7 +134,7 @@ class Diagnoser:
         costs: Mapping[Literal | str, float] | None = None,
         seconds: float = math.inf,
     ) -> tuple[Probe, ...]:
-        """What to look at next to tell the candidates apart, the most telling first; empty if nothing would.
+        """Say what to look at next to tell candidates apart, the most telling first; empty if nothing would.
 
         Args:
             observations: those of the diagnosis.

@@ -21,7 +21,7 @@ MOST_NAMES: Final = 5
 
 
 class State(enum.Enum):
-    """How the system looks by a diagnosis."""
+    """The four ways in which a system may look by a diagnosis."""
 
     HEALTHY = "healthy"
     FAULTY = "faulty"
@@ -92,7 +92,7 @@ class Diagnosis(Message):
         return f"{self.state.value}{some}"
 
     def unknown_in_words(self) -> str:
-        """Who is unknown, and until when it was not, in local time: a few by name, who was known last first."""
+        """Name a few that are unknown, and until when each was not, in local time: who was known last first."""
         latest = sorted(self.unknown, key=lambda name: -self.known_until.get(name, 0.0))
         said = [f"{name} {self._known_until(name)}" for name in latest[:MOST_NAMES]]
         more = len(latest) - len(said)
@@ -123,7 +123,7 @@ class Diagnosis(Message):
         return tuple(name for name in self.components if name in shared)
 
     def good(self, candidate: Candidate) -> tuple[str, ...]:
-        """What works if `candidate` is right: good and bad together are all components (D32)."""
+        """Return all components that work if `candidate` is right: good and bad together are all (D32)."""
         bad = set(candidate.bad)
         return tuple(name for name in self.components if name not in bad)
 
@@ -132,7 +132,7 @@ class Diagnosis(Message):
         return [{"bad": list(one.bad), "good": list(self.good(one))} for one in self.candidates]
 
     def ros(self, stamp: float) -> Plain:
-        """As a `diagnostic_msgs/DiagnosticArray`: error if surely faulty, warning if perhaps, stale if unknown (D33).
+        """Make a `diagnostic_msgs/DiagnosticArray`: error if surely faulty, warning if perhaps, stale if unknown (D33).
 
         Args:
             stamp: seconds since 1970.

@@ -176,7 +176,7 @@ class System:
         self._propositions += map(str, atoms)
 
     def declaration(self) -> Declaration:
-        """What was collected so far."""
+        """Return all that was collected so far, as plain data."""
         return Declaration(
             components=settle_kinds(self._components),
             values=tuple(self._values),

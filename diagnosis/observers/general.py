@@ -93,7 +93,7 @@ class GeneralObserver(Observer):
                 self.verdict(self._atom, is_good)
 
     def afresh(self, names: Collection[str]) -> None:
-        """What came before somebody acted says nothing of after: it would be counted for a window longer."""
+        """Begin to count anew: what came before somebody acted would be counted for a window longer."""
         self._times.clear()
         self._since = self.now
         self.verdict(self._atom, None)

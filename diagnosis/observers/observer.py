@@ -24,7 +24,7 @@ RENEWALS: Final = 3
 
 
 class Manner(msgspec.Struct, frozen=True, kw_only=True):
-    """How an observer goes about it.
+    """The habits of an observer: how often it looks, and when it believes what it sees.
 
     Attributes:
         every: seconds between two looks; silence is seen by looking.
@@ -87,10 +87,10 @@ class Observer(Actor):
         """A message was published on one of the topics."""
 
     def look(self) -> Awaitable[None] | None:
-        """It is time to look; may be async."""
+        """Look at what is observed, as is done every so often; may be async."""
 
     def spares(self, grace: Grace, about: Literal) -> bool:
-        """Whether a grace is for what is said of this."""
+        """Say whether a grace is for what is said of this."""
         return not set(grace.names).isdisjoint(about.args)
 
     def afresh(self, names: Collection[str]) -> None:
@@ -129,7 +129,7 @@ class Observer(Actor):
             self._settle(word, settled)
 
     def said(self, about: Literal | str) -> bool | None:
-        """What was settled of an atom: it holds, or does not, or (None) it is unknown."""
+        """Return what was settled of an atom: it holds, or does not, or (None) it is unknown."""
         word = self._words.get(literal_of(about))
         settled = word.debounce.settled if word is not None else None
         return None if settled is None else settled.positive

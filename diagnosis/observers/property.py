@@ -33,7 +33,7 @@ PATIENCE: Final = 1.0
 
 
 class Property(enum.Enum):
-    """What can be measured of an actor."""
+    """The properties that can be measured of an actor and its process."""
 
     CPU = "cpu"
     """Percent of one core, of its process."""
