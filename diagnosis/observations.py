@@ -33,7 +33,7 @@ class Observation(Message, gc=False):
     time_to_live: float = 5.0
 
     def is_current(self, now: float) -> bool:
-        """Whether it still counts at `now`."""
+        """Say whether it still counts at `now`."""
         return now <= self.time + self.time_to_live
 
 
