@@ -6,6 +6,8 @@ import pytest
 
 import holdfast as hf
 from holdfast import diagnosis
+from holdfast.console.diagnosed import diagnosed
+from holdfast.console.operate.diagnosing import diagnosis_lines
 from holdfast.diagnosis import Watch
 from holdfast.diagnosis.engine import State
 from holdfast.diagnosis.literals import ok
@@ -24,7 +26,7 @@ class Ask(hf.Message): ...
 
 class Ledger(hf.Actor):
     def on_start(self, restored: bool) -> None:
-        self.ctx.every(0.1, Ask())
+        self.ctx.every(0.5, Ask())
 
     @hf.on(Ask)
     def _ask(self, message: Ask) -> None: ...
@@ -100,6 +102,8 @@ async def test_an_observer_that_crashes_is_named(system: hf.ActorSystem, crashes
     crashed = "observer /app/diagnosis/observers/disk has crashed: OSError: no such device"
     assert crashed in str(said)
     assert crashed in (await found.why()).text
+    (shown,) = await diagnosed(system, None, 1.0)
+    assert any(crashed in line for line in diagnosis_lines(shown))
     if not knows:
         assert said.unknown == ("ledger",)
     elif len(crashes) < 4:

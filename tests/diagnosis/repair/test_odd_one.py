@@ -65,7 +65,7 @@ async def test_the_two_that_agree_are_never_touched() -> None:
             for a, b in combinations(NAMES, 2)
         ]
         pairs = diagnosis.observer("pairs", hf.start(Pairs))
-        policy = Policy(settle=0.5, verify=3.0, approval=5.0)
+        policy = Policy(settle=0.5, verify=3.0, approval=1.0)
         watching = await diagnosis.watch(system, observers=[pairs], expect=agree, policy=policy, repair="on")
         told = list[hf.Message[Any]]()
         system.spawn(hf.start(Secretary, told, [], asyncio.Event()), name="secretary")
