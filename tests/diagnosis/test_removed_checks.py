@@ -34,9 +34,9 @@ CHECKS = {
         "nobody_observes",
     ),
     "who was suspected is unknown until that is seen to have gone": Check(
-        "diagnosis/diagnoser.py",
-        "if name in {*diagnosis.unknown, *uncleared})",
-        "if name in diagnosis.unknown)",
+        "diagnosis/doubts.py",
+        "if not observed.has_gone(symptom)}",
+        "if False}",
         EVIDENCE,
         "seen_to_have_gone",
     ),
