@@ -273,6 +273,8 @@ async def _said(
         "symptoms": list(map(str, found.symptoms)),
         "contradictions": list(map(str, found.contradictions)),
         "truncated": list(found.truncated),
+        "unknown": list(found.unknown),
+        "crashed_observers": found.crashed_observers,
         "why": why.text,
         "next_best": [{"atom": str(one.atom), "gain_bits": one.gain} for one in why.next_best],
         "refused": list(why.refused),

@@ -15,7 +15,9 @@ if missing := [name for name in ("clingo", "yaml") if find_spec(name) is None]:
 
 from .assembly import observer, tree
 from .diagnoser import DiagnoserActor
+from .engine import Diagnoser, Diagnosis, State
 from .generate import Generated, Wired, generate, observers_for
+from .literals import ok, parse
 from .live_limits import expecting, property_observers
 from .messages import (
     DIAGNOSIS,
@@ -23,6 +25,7 @@ from .messages import (
     GRACE,
     MODEL,
     OBSERVATIONS,
+    OBSERVERS,
     REPAIR,
     ROS_DIAGNOSTICS,
     TOUCHED,
@@ -33,9 +36,11 @@ from .messages import (
     Grace,
     ModelChanged,
     NextBest,
+    ObserverCrashed,
     RosDiagnostics,
     Touched,
 )
+from .model import Expectation, Model, System, lint
 from .model_server import (
     ChangeModel,
     GetModel,
@@ -46,15 +51,22 @@ from .model_server import (
     RollBackModel,
     ValidateModel,
 )
+from .observations import Observation
+from .observers import GeneralObserver, Limits, Manner, Observer, Property
+from .repair import Policy
 from .system_watch import Watch, watch
 
 __all__ = [
     "ChangeModel",
     "DIAGNOSIS",
+    "Diagnoser",
     "DiagnoserActor",
+    "Diagnosis",
     "EXPLANATION",
+    "Expectation",
     "Explained",
     "GRACE",
+    "GeneralObserver",
     "Generated",
     "GetDiagnosis",
     "GetExplanation",
@@ -62,17 +74,28 @@ __all__ = [
     "GetObserved",
     "GetVersions",
     "Grace",
+    "Limits",
     "LoadModel",
     "MODEL",
+    "Manner",
+    "Model",
     "ModelChanged",
     "ModelRefused",
     "ModelServer",
     "NextBest",
     "OBSERVATIONS",
+    "OBSERVERS",
+    "Observation",
+    "Observer",
+    "ObserverCrashed",
+    "Policy",
+    "Property",
     "REPAIR",
     "ROS_DIAGNOSTICS",
     "RollBackModel",
     "RosDiagnostics",
+    "State",
+    "System",
     "TOUCHED",
     "Touched",
     "ValidateModel",
@@ -80,8 +103,11 @@ __all__ = [
     "Wired",
     "expecting",
     "generate",
+    "lint",
     "observer",
     "observers_for",
+    "ok",
+    "parse",
     "property_observers",
     "tree",
     "watch",

@@ -11,6 +11,7 @@ import msgspec
 from ..actors.kernel.actor import Actor, on, subscribe
 from ..actors.kernel.envelope import ReplyHandle
 from ..actors.kernel.message import Message
+from .doubts import Doubts
 from .engine import Diagnoser, Diagnosis, State
 from .engine.breath import beside_a_loop
 from .literals import BadLiteral, Literal
@@ -20,6 +21,7 @@ from .messages import (
     GRACE,
     MODEL,
     OBSERVATIONS,
+    OBSERVERS,
     ROS_DIAGNOSTICS,
     STARTS,
     TOUCHED,
@@ -31,6 +33,7 @@ from .messages import (
     Grace,
     ModelChanged,
     NextBest,
+    ObserverCrashed,
     RosDiagnostics,
     Touched,
 )
@@ -77,11 +80,15 @@ class _Understood(Message):
 
 
 class _Most(NamedTuple):
-    """What one diagnosis may take: candidates that are listed, seconds for them, and seconds for the explanation."""
+    """What one diagnosis may take: candidates that are listed, seconds for them, and seconds for the explanation.
+
+    `recent`: seconds for which what was repaired is suspected last.
+    """
 
     candidates: int
     seconds: float
     explaining: float
+    recent: float
 
 
 class DiagnoserActor(Actor):
@@ -113,8 +120,8 @@ class DiagnoserActor(Actor):
         recent: float = 30.0,
         trust: Mapping[str, float] | None = None,
     ) -> None:
-        self._quiet, self._recent = quiet, recent
-        self._most = _Most(limit, seconds, explaining)
+        self._quiet = quiet
+        self._most = _Most(limit, seconds, explaining, recent)
         self._trust = dict(trust or {})
         self._repaired: dict[str, float] = {}
         self._refused: dict[tuple[str, str], str] = {}
@@ -128,6 +135,7 @@ class DiagnoserActor(Actor):
         self._changed = self._first = float("-inf")
         self._known: object = None
         self._expiry = float("inf")
+        self._doubts = Doubts()
 
     async def on_start(self, restored: bool) -> None:
         """Ask the model server for the model that is in force."""
@@ -167,12 +175,19 @@ class DiagnoserActor(Actor):
                 if observation.literal in model.vocabulary:
                     self._observations.add(observation)
         self._refused.clear()
+        self._doubts.keep(model.vocabulary)
+        self._due()
+
+    @subscribe(OBSERVERS)
+    @on(ObserverCrashed)
+    def _observer_crashed(self, message: ObserverCrashed) -> None:
+        self._watch(self._doubts.note_crash(message.source, message.why, self._now))
         self._due()
 
     @subscribe(TOUCHED)
     @on(Touched)
     async def _touched(self, message: Touched) -> None:
-        until = message.time + self._recent
+        until = message.time + self._most.recent
         self._repaired |= dict.fromkeys(message.components, until)
         if message.grace > 0:
             names = _names_below(self._engine.model, message.components)
@@ -229,13 +244,13 @@ class DiagnoserActor(Actor):
     @on(_Expire)
     def _expire(self, message: _Expire) -> None:
         now = self._now
-        if self._observations.expire(now):
+        if any((self._observations.expire(now), self._doubts.expire(now))):
             self._due()
         if self._expiry <= now:
             self._expiry = float("inf")
-            following = self._observations.next_expiry()
-            if following is not None:
-                self._watch(following)
+            for following in (self._observations.next_expiry(), self._doubts.next_expiry()):
+                if following is not None:
+                    self._watch(following)
 
     @on(_Think)
     def _think(self, message: _Think) -> None:
@@ -247,7 +262,8 @@ class DiagnoserActor(Actor):
         self._is_due = False
         observed = self._believed(now)
         repaired = frozenset(name for name, until in self._repaired.items() if until > now)
-        known = (observed.positive, observed.negative, _torn(observed), repaired, self._engine.model.version)
+        version, crashed = self._engine.model.version, self._doubts.crashed
+        known = (observed.positive, observed.negative, _torn(observed), repaired, crashed, version)
         if known == self._known:
             self._rest()
             return
@@ -286,17 +302,19 @@ class DiagnoserActor(Actor):
         """Say why a diagnosis was made; this is run in a thread."""
         refused = tuple(self._refused.values())
         aside = [f"{source} contradicts several others, and is not believed" for source in diagnosis.set_aside]
+        unseen = [f"nobody says whether {atom} holds" for atom in engine.unseen(observed)]
+        crashed = [f"observer {path} has crashed: {why}" for path, why in diagnosis.crashed_observers.items()]
         torn = [*map(str, diagnosis.contradictions), *aside]
         if diagnosis.state is not State.FAULTY:
             text = "\n".join(torn) or _STATES[diagnosis.state]
             if diagnosis.state is State.HEALTHY and diagnosis.unknown:
                 text += f"; nothing is seen of the work of {diagnosis.unknown_in_words()}"
-            return Explained(text, refused=refused)
+            return Explained("\n".join([text, *unseen, *crashed]), refused=refused)
         with beside_a_loop():
             why = engine.explain(observed, seconds=self._most.explaining)
             probes = engine.next_observations(observed, diagnosis, seconds=self._most.explaining)[:SUGGESTED]
         return Explained(
-            "\n".join([str(why), *torn]),
+            "\n".join([str(why), *torn, *unseen, *crashed]),
             tuple(map(str, why.conflicts)),
             tuple(map(str, why.consequences)),
             tuple(NextBest(probe.atom, probe.gain) for probe in probes),
@@ -307,7 +325,7 @@ class DiagnoserActor(Actor):
     async def _conclude(self, message: _Thought) -> None:
         is_of_now = message.diagnosis.version == self._engine.model.version  # Else the model has changed meanwhile.
         if is_of_now:
-            diagnosis = await self._tell(message.diagnosis)
+            diagnosis = await self._tell(message.diagnosis, message.observed)
             message = msgspec.structs.replace(message, diagnosis=diagnosis)
         if is_of_now and not message.is_last and not self._is_due:
             self.ctx.pipe_to_self(self._rest_of(self._engine, message), lambda thought: thought)
@@ -321,8 +339,13 @@ class DiagnoserActor(Actor):
         else:
             self._rest()
 
-    async def _tell(self, diagnosis: Diagnosis) -> Diagnosis:
-        """Publish it if it says something new; returns it with the moments since when it does."""
+    async def _tell(self, diagnosis: Diagnosis, observed: Observed) -> Diagnosis:
+        """Publish it if it says something new; returns it with all that is known besides."""
+        uncleared = self._doubts.uncleared(diagnosis, observed)
+        if diagnosis.state in (State.HEALTHY, State.FAULTY):
+            unknown = tuple(name for name in diagnosis.components if name in {*diagnosis.unknown, *uncleared})
+            diagnosis = msgspec.structs.replace(diagnosis, unknown=unknown, uncleared=uncleared)
+        diagnosis = msgspec.structs.replace(diagnosis, crashed_observers=dict(self._doubts.crashed))
         before, now = self._newest, self.ctx._cell.node.clock.wall()
         known = {} if before is None else before.since
         since = {name: known.get(name, now) for name in diagnosis.suspects}
@@ -389,6 +412,8 @@ def _content(diagnosis: Diagnosis) -> object:
     torn = tuple(one.literals for one in diagnosis.contradictions)
     return (
         diagnosis.convicted,
+        diagnosis.crashed_observers,
+        diagnosis.uncleared,
         diagnosis.set_aside,
         diagnosis.state,
         diagnosis.components,

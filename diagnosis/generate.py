@@ -7,6 +7,7 @@ what is heard, for a while, on every topic that has subscribers. The actors do n
 from __future__ import annotations
 
 import asyncio
+import functools
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Any, Final, Protocol, TypeVar
@@ -365,14 +366,15 @@ def evident(
     known = {component.name for component in declaration.components}
     actors = [name for name in components if name in known]
     outs = {out for component in declaration.components for out in component.out}
-    expected = [Expectation(str(atom(name)), (name,)) for name in actors for atom in (progress, room, keeps_up)]
-    expected += [Expectation(str(replies(name)), (name,)) for name in actors if str(replies(name)) not in outs]
+    made = functools.partial(Expectation, is_quiet=True)
+    expected = [made(str(atom(name)), (name,)) for name in actors for atom in (progress, room, keeps_up)]
+    expected += [made(str(replies(name)), (name,)) for name in actors if str(replies(name)) not in outs]
     groups = [name for name in protected if name in known]
     if taken := tuple(replicas_of(name) for name in groups if replicas_of(name) in known):
         why = "this name stands for the replicas of a protected actor; call the component of the model otherwise"
         raise ModelError(tuple(f"{name}: {why}" for name in taken))
-    expected += [Expectation(str(led(name)), (name,)) for name in groups]
-    expected += [Expectation(str(atom(name)), (replicas_of(name),)) for name in groups for atom in (whole, caught_up)]
+    expected += [made(str(led(name)), (name,)) for name in groups]
+    expected += [made(str(atom(name)), (replicas_of(name),)) for name in groups for atom in (whole, caught_up)]
     seen = [str(crashes(name)) for name in actors]
     seen += [str(waits_for(one, other)) for one, other in dict.fromkeys(waits) if one in known and other in known]
     return msgspec.structs.replace(
@@ -386,7 +388,7 @@ def evident(
 def _shared(topic: str, inputs: dict[str, list[str]], outputs: dict[str, list[str]]) -> Expectation:
     publishers = tuple(name for name, outs in outputs.items() if topic in outs)
     given = dict.fromkeys(str(made_atom(wanted)) for name in publishers for wanted in inputs[name])
-    return Expectation(str(made_atom(topic)), publishers, tuple(given))
+    return Expectation(str(made_atom(topic)), publishers, tuple(given), is_quiet=True)
 
 
 def _cut_circles(inputs: dict[str, list[str]], outputs: dict[str, list[str]]) -> tuple[str, ...]:

@@ -79,7 +79,7 @@ class Literal(msgspec.Struct, frozen=True, order=True, array_like=True, cache_ha
 
 
 def ok(topic: str) -> Literal:
-    """What is published on `topic`, or a named property, is as it should be."""
+    """Make the atom that a topic, or anything else that has a name, is as it should be."""
     return Literal("ok", (topic,))
 
 
@@ -202,6 +202,30 @@ def parse(text: str) -> Literal:
     return Literal(found[3], args, not (found[1] or found[2]))
 
 
+def literal_of(given: Literal | str) -> Literal:
+    """Return a literal that is given as such, or as its text.
+
+    Raises:
+        BadLiteral: the text is none. TypeError: it is neither.
+
+    >>> literal_of("not ok(/odom)") == literal_of(~ok("/odom"))
+    True
+    """
+    if isinstance(given, Literal):
+        return given
+    if isinstance(given, str):
+        return parse(given)
+    raise TypeError(f"a literal, or its text such as 'ok(/odom)', is wanted, and not {given!r}")
+
+
+def atom_of(given: Literal | str) -> Literal:
+    """Return an atom that is given as such, or as its text. Raises BadLiteral, also for a negation; TypeError."""
+    literal = literal_of(given)
+    if not literal.positive:
+        raise BadLiteral(str(literal), "an observer is told of the atom; whether it holds is what it finds out")
+    return literal
+
+
 class Vocabulary:
     """The atoms that exist: those the model declares, and no other (T53).
 
@@ -222,12 +246,13 @@ class Vocabulary:
     def __contains__(self, literal: Literal) -> bool:
         return literal.atom in self._atoms
 
-    def check(self, literal: Literal) -> Literal:
+    def check(self, given: Literal | str) -> Literal:
         """The literal as it was declared (the arguments of a symmetric predicate in their declared order).
 
         Raises:
-            BadLiteral: the model has no such atom.
+            BadLiteral: a text is no literal, or the model has no such atom. TypeError: it is neither literal nor text.
         """
+        literal = literal_of(given)
         declared = self._atoms.get(literal.atom)
         if declared is None:
             raise BadLiteral(str(literal), self._unknown(literal))

@@ -26,6 +26,8 @@ GRACE: Final = "/grace"
 """`Grace`, from whoever acts upon the system."""
 STARTS: Final = "/starts"
 """`ComponentsStarted`, from whoever sees that a component has begun a new life."""
+OBSERVERS: Final = "/observers"
+"""`ObserverCrashed`, from an observer that has crashed."""
 REPAIR: Final = "/repair"
 """Whatever repair tells of its cases."""
 TOUCHED: Final = "/touched"
@@ -66,6 +68,13 @@ class ComponentsStarted(Message):
 
     components: tuple[str, ...]
     seconds: float
+
+
+class ObserverCrashed(Message):
+    """An observer has crashed: it may be that nobody sees any more what it was to look at."""
+
+    source: str
+    why: str
 
 
 class ModelChanged(Message):
@@ -119,6 +128,7 @@ __all__ = [
     "GRACE",
     "MODEL",
     "OBSERVATIONS",
+    "OBSERVERS",
     "REPAIR",
     "ROS_DIAGNOSTICS",
     "STARTS",
@@ -131,6 +141,7 @@ __all__ = [
     "Grace",
     "ModelChanged",
     "NextBest",
+    "ObserverCrashed",
     "RosDiagnostics",
     "Touched",
 ]

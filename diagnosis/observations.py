@@ -33,7 +33,7 @@ class Observation(Message, gc=False):
     time_to_live: float = 5.0
 
     def is_current(self, now: float) -> bool:
-        """Whether it still counts at `now`."""
+        """Say whether it still counts at `now`."""
         return now <= self.time + self.time_to_live
 
 
@@ -67,6 +67,14 @@ class Observed(msgspec.Struct, frozen=True):
     def is_blind(self) -> bool:
         """Nothing is known: no repair may start from this."""
         return not (self.positive or self.negative or self.contradictions)
+
+    def has_gone(self, symptom: Literal) -> bool:
+        """Whether a symptom is seen to have gone; that nobody says anything of it any more is no cure."""
+        if (
+            symptom.positive
+        ):  # A trend gives way to another one: that it is not said any more is all that is to be seen.
+            return symptom not in self.positive
+        return symptom.atom in self.positive
 
     @classmethod
     def of(cls, literals: Iterable[Literal]) -> Observed:

@@ -9,12 +9,21 @@ import asyncio
 
 import holdfast as hf
 from holdfast import diagnosis
-from holdfast.diagnosis import DIAGNOSIS, OBSERVATIONS, REPAIR
-from holdfast.diagnosis.engine import Diagnosis
-from holdfast.diagnosis.model import Expect, Expectation
-from holdfast.diagnosis.observations import Observation
-from holdfast.diagnosis.observers import Agreement, Check, DiagnosticObserver, Limits, Manner, Property
-from holdfast.diagnosis.repair import ActionBegan, GaveUp, Policy, Repaired
+from holdfast.diagnosis import (
+    DIAGNOSIS,
+    OBSERVATIONS,
+    REPAIR,
+    Diagnosis,
+    Expectation,
+    Limits,
+    Manner,
+    Observation,
+    Policy,
+    Property,
+)
+from holdfast.diagnosis.model import Expect
+from holdfast.diagnosis.observers import Agreement, Check, DiagnosticObserver
+from holdfast.diagnosis.repair import ActionBegan, GaveUp, Repaired
 
 # -- the service -----------------------------------------------------------------------------------------------------
 

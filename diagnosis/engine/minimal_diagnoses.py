@@ -8,7 +8,7 @@ import math
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Final
 
 import msgspec
@@ -17,7 +17,7 @@ from ..literals import Literal
 from ..model import Declaration, Model, System
 from ..observations import Contradiction, Observed
 from .breath import beside_a_loop, breathe, breathing
-from .cone import Cone, Index, RulePart, cone_of, contradiction
+from .cone import Claim, Cone, Index, RulePart, cone_of, contradiction
 from .explain import Explanation, explain
 from .probe import Probe, probes
 from .rank import Ranked, Ranking, merged, products
@@ -70,7 +70,7 @@ class Diagnoser:
     async def diagnose(
         self, observations: Observations, *, repaired: Collection[str] = (), seconds: float | None = None
     ) -> Diagnosis:
-        """As `diagnose_now`, in a thread: the event loop goes on meanwhile. A cancellation stops the search.
+        """Diagnose as `diagnose_now` does, in a thread: the event loop goes on. A cancellation stops the search.
 
         Raises:
             BadLiteral: an observation has a name that the model does not declare.
@@ -115,7 +115,7 @@ class Diagnoser:
         return observations
 
     def explain(self, observations: Observations, *, seconds: float = math.inf) -> Explanation:
-        """Why there is something to repair: minimal conflicts, and failures that follow from others.
+        """Explain why there is something to repair: minimal conflicts, and failures that follow from others.
 
         Args:
             observations: those of the diagnosis.
@@ -130,11 +130,11 @@ class Diagnoser:
         observations: Observations,
         diagnosis: Diagnosis,
         *,
-        can_be_seen: Iterable[Literal] | None = None,
-        costs: Mapping[Literal, float] | None = None,
+        can_be_seen: Iterable[Literal | str] | None = None,
+        costs: Mapping[Literal | str, float] | None = None,
         seconds: float = math.inf,
     ) -> tuple[Probe, ...]:
-        """What to look at next to tell the candidates apart, the most telling first; empty if nothing would.
+        """Say what to look at next to tell candidates apart, the most telling first; empty if nothing would.
 
         Args:
             observations: those of the diagnosis.
@@ -145,9 +145,11 @@ class Diagnoser:
         """
         index = self._index
         positive, negative, _ = self._believed(self.observed(observations))
-        seen = index.numbers(tuple(can_be_seen)) if can_be_seen is not None else None
+        check = index.model.vocabulary.check
+        seen = None if can_be_seen is None else index.numbers([check(atom) for atom in can_be_seen])
         until = time.monotonic() + seconds
-        return probes(index, positive, negative, diagnosis.candidates, seen, costs or {}, until)
+        priced = {check(atom): cost for atom, cost in (costs or {}).items()}
+        return probes(index, positive, negative, diagnosis.candidates, seen, priced, until)
 
     def _beside(self, observations: Observations, repaired: frozenset[str], budget: SearchBudget) -> Diagnosis:
         with beside_a_loop():
@@ -167,7 +169,9 @@ class Diagnoser:
                     state = State.FAULTY if is_faulty else State.CONTRADICTORY
                     candidates = made.candidates if is_faulty else ()
                     made = msgspec.structs.replace(made, state=state, candidates=candidates, contradictions=torn)
-                made = msgspec.structs.replace(made, unknown=self._unknown(positive), set_aside=observed.set_aside)
+                made = msgspec.structs.replace(
+                    made, unknown=self._unknown(positive, negative), set_aside=observed.set_aside
+                )
             return msgspec.structs.replace(
                 made,
                 components=self._index.names,
@@ -191,13 +195,27 @@ class Diagnoser:
         atoms = self._index.numbers([literal.atom for one in torn for literal in one.literals])
         return frozenset(one for atom in atoms for step in self._index.makers[atom] for one in step.needs)
 
-    def _unknown(self, positive: frozenset[int]) -> tuple[str, ...]:
-        """The components of whose work nothing is seen; that one runs says nothing of its work, if it has any."""
+    def unseen(self, observations: Observations) -> tuple[Literal, ...]:
+        """Return the expected atoms of which nobody says whether they hold, though what they are made from does."""
+        positive, negative, _ = self._believed(self.observed(observations))
+        atoms = (self._index.atoms[one.atom] for one in self._unseen(positive, negative))
+        return tuple(dict.fromkeys(atom for atom in atoms if atom is not None))
+
+    def _unseen(self, positive: frozenset[int], negative: frozenset[int]) -> Iterator[Claim]:
+        known = positive | negative
+        return (one for one in self._index.claims if one.atom not in known and negative.isdisjoint(one.given))
+
+    def _unknown(self, positive: frozenset[int], negative: frozenset[int]) -> tuple[str, ...]:
+        """The components of whose work nothing is seen; that one runs says nothing of its work, if it has any.
+
+        Whoever is to make something hold of which nobody says whether it does is unknown, too.
+        """
         index, seen = self._index, set[int]()
         for atom in positive:
             is_work = index.is_work(atom)
             for step in index.makers[atom]:
                 seen.update(one for one in step.needs if is_work or one in index.only_run)
+        seen.difference_update(*(one.needs for one in self._unseen(positive, negative)))
         return tuple(name for number, name in enumerate(index.names) if number not in seen)
 
     def _solved(

@@ -21,7 +21,7 @@ MOST_NAMES: Final = 5
 
 
 class State(enum.Enum):
-    """How the system looks by a diagnosis."""
+    """The four ways in which a system may look by a diagnosis."""
 
     HEALTHY = "healthy"
     FAULTY = "faulty"
@@ -62,9 +62,14 @@ class Diagnosis(Message):
     convicted: tuple[str, ...] = ()
     """Components that are faulty whatever else is: known even where `truncated` says that candidates are missing."""
     unknown: tuple[str, ...] = ()
-    """Components of whose work nothing is seen at the moment: that they are healthy is not said."""
+    """Components of whose work nothing is seen at the moment, or not what is expected of them, or that are `uncleared`:
+    that they are healthy is not said."""
     set_aside: tuple[str, ...] = ()
     """Sources of observations that are not believed, because they contradict several others that agree."""
+    uncleared: tuple[str, ...] = ()
+    """Those of `unknown` that were suspected by symptoms that nobody has seen to have gone, as in a grace."""
+    crashed_observers: dict[str, str] = msgspec.field(default_factory=dict)
+    """Observers that have crashed within the last minute, each with the reason: what they look at may not be seen."""
     since: dict[str, float] = msgspec.field(default_factory=dict)
     """Since when each suspect has been one without a break, in Unix seconds."""
     known_until: dict[str, float] = msgspec.field(default_factory=dict)
@@ -72,6 +77,10 @@ class Diagnosis(Message):
 
     def __str__(self) -> str:
         """In words: `faulty: ja, or jn`."""
+        crashed = (f"; observer {path} has crashed: {why}" for path, why in self.crashed_observers.items())
+        return "".join((self._found(), *crashed))
+
+    def _found(self) -> str:
         words = ", or ".join(" and ".join(one.bad) for one in self.candidates if one.bad)
         more = f", or others ({' and '.join(self.truncated)} ran out)" if self.truncated else ""
         if words:
@@ -83,7 +92,7 @@ class Diagnosis(Message):
         return f"{self.state.value}{some}"
 
     def unknown_in_words(self) -> str:
-        """Who is unknown, and until when it was not, in local time: a few by name, who was known last first."""
+        """Name a few that are unknown, and until when each was not, in local time: who was known last first."""
         latest = sorted(self.unknown, key=lambda name: -self.known_until.get(name, 0.0))
         said = [f"{name} {self._known_until(name)}" for name in latest[:MOST_NAMES]]
         more = len(latest) - len(said)
@@ -114,7 +123,7 @@ class Diagnosis(Message):
         return tuple(name for name in self.components if name in shared)
 
     def good(self, candidate: Candidate) -> tuple[str, ...]:
-        """What works if `candidate` is right: good and bad together are all components (D32)."""
+        """Return all components that work if `candidate` is right: good and bad together are all (D32)."""
         bad = set(candidate.bad)
         return tuple(name for name in self.components if name not in bad)
 
@@ -123,7 +132,7 @@ class Diagnosis(Message):
         return [{"bad": list(one.bad), "good": list(self.good(one))} for one in self.candidates]
 
     def ros(self, stamp: float) -> Plain:
-        """As a `diagnostic_msgs/DiagnosticArray`: error if surely faulty, warning if perhaps, stale if unknown (D33).
+        """Make a `diagnostic_msgs/DiagnosticArray`: error if surely faulty, warning if perhaps, stale if unknown (D33).
 
         Args:
             stamp: seconds since 1970.

@@ -11,6 +11,8 @@ from typing import Final
 
 import msgspec
 
+from ..literals import Literal
+
 DEFAULT_PRIOR: Final = 0.01
 
 
@@ -69,6 +71,12 @@ class Expectation(msgspec.Struct, frozen=True):
     of: tuple[str, ...]
     given: tuple[str, ...] = ()
     where: str = ""
+    is_quiet: bool = False
+    """That nobody says anything of the atom says nothing; else the components are unknown meanwhile."""
+
+    def __post_init__(self) -> None:
+        msgspec.structs.force_setattr(self, "atom", str(self.atom))  # An atom, or its text.
+        msgspec.structs.force_setattr(self, "given", tuple(map(str, self.given)))
 
 
 class Clause(msgspec.Struct, frozen=True):
@@ -151,9 +159,9 @@ class System:
         """Two (component, value) whose trends are alike."""
         self._relations.append(Relation(one, other))
 
-    def expect(self, atom: str, *, of: Iterable[str], given: Iterable[str] = ()) -> None:
+    def expect(self, atom: Literal | str, *, of: Iterable[str], given: Iterable[Literal | str] = ()) -> None:
         """`atom` (such as `ok(memory)`) holds while the components `of` work and the atoms `given` hold."""
-        self._expectations.append(Expectation(atom, tuple(of), tuple(given)))
+        self._expectations.append(Expectation(str(atom), tuple(of), tuple(map(str, given))))
 
     def clause(self, text: str) -> None:
         """A Horn clause of any other form, such as `NAB(a), ok(/x) -> ok(/y)`."""
@@ -163,12 +171,12 @@ class System:
         """Topics that come from outside the model."""
         self._propositions += (f"ok({topic})" for topic in topics)
 
-    def proposition(self, *atoms: str) -> None:
+    def proposition(self, *atoms: Literal | str) -> None:
         """Further atoms that may be observed and used in clauses."""
-        self._propositions += atoms
+        self._propositions += map(str, atoms)
 
     def declaration(self) -> Declaration:
-        """What was collected so far."""
+        """Return all that was collected so far, as plain data."""
         return Declaration(
             components=settle_kinds(self._components),
             values=tuple(self._values),

@@ -36,7 +36,7 @@ class Finding(msgspec.Struct, frozen=True):
         return f"{', '.join(self.components)}: {self.flaw.value}; {self.advice}"
 
 
-def lint(model: Model, observed: Iterable[Literal] | None = None) -> tuple[Finding, ...]:
+def lint(model: Model, observed: Iterable[Literal | str] | None = None) -> tuple[Finding, ...]:
     """All weaknesses of a model.
 
     Args:

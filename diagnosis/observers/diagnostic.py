@@ -7,8 +7,8 @@ from typing import Any
 
 import msgspec
 
-from ..literals import Literal
-from .observer import Manner, Observer, atom_of
+from ..literals import Literal, atom_of
+from .observer import Manner, Observer
 from .verdicts import Filter, Limits, Read, reader
 
 

@@ -13,6 +13,7 @@ from typing import Any, Final
 import msgspec
 
 from ...actors.events import Event, LogLine
+from ...actors.exit_reasons import ExitReason
 from ...actors.kernel.actor import on
 from ...actors.kernel.address_host import Work
 from ...actors.kernel.cell import Cell
@@ -319,8 +320,9 @@ class FlowObserver(Observer):
             self._saved = self.now
             await self._baselines.save()
 
-    async def on_stop(self, reason: Any) -> None:
+    async def on_stop(self, reason: ExitReason) -> None:
         """Keep what was learned beyond this life."""
+        await super().on_stop(reason)
         await self._baselines.save()
 
     def _learn_from_before(self) -> None:

@@ -9,8 +9,8 @@ from collections import deque
 from collections.abc import Collection
 from typing import Any, Final
 
-from ..literals import Literal, ok
-from .observer import Manner, Observer, atom_of
+from ..literals import Literal, atom_of, ok
+from .observer import Manner, Observer
 
 LEARNING: Final = 5
 """Windows from which a rate is learned that was not given."""
@@ -93,7 +93,7 @@ class GeneralObserver(Observer):
                 self.verdict(self._atom, is_good)
 
     def afresh(self, names: Collection[str]) -> None:
-        """What came before somebody acted says nothing of after: it would be counted for a window longer."""
+        """Begin to count anew: what came before somebody acted would be counted for a window longer."""
         self._times.clear()
         self._since = self.now
         self.verdict(self._atom, None)

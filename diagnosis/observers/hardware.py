@@ -7,8 +7,8 @@ from typing import Any
 import msgspec
 
 from ..board.board_actor import TOPIC, BoardMeasured
-from ..literals import Literal, on
-from .observer import Manner, Observer, atom_of
+from ..literals import Literal, atom_of, on
+from .observer import Manner, Observer
 from .verdicts import Limits
 
 

@@ -6,8 +6,8 @@ from collections import deque
 from collections.abc import Callable, Collection
 from typing import Any, Final
 
-from ..literals import Literal
-from .observer import Manner, Observer, atom_of
+from ..literals import Literal, atom_of
+from .observer import Manner, Observer
 
 PENDING: Final = 10_000
 """Triggers that wait for their effect at most; of more, the oldest are left out."""

@@ -10,10 +10,11 @@ from typing import Any, Final
 
 import msgspec
 
+from ...actors.exit_reasons import Crash, ExitReason
 from ...actors.kernel.actor import Actor, on, subscribe
 from ...actors.kernel.message import Message
-from ..literals import BadLiteral, Literal, parse
-from ..messages import GRACE, OBSERVATIONS, Grace
+from ..literals import Literal, atom_of, literal_of
+from ..messages import GRACE, OBSERVATIONS, OBSERVERS, Grace, ObserverCrashed
 from ..observations import Observation
 from .hearing import Heard, listen
 from .verdicts import Agreement, Debounce
@@ -23,7 +24,7 @@ RENEWALS: Final = 3
 
 
 class Manner(msgspec.Struct, frozen=True, kw_only=True):
-    """How an observer goes about it.
+    """The habits of an observer: how often it looks, and when it believes what it sees.
 
     Attributes:
         every: seconds between two looks; silence is seen by looking.
@@ -86,10 +87,10 @@ class Observer(Actor):
         """A message was published on one of the topics."""
 
     def look(self) -> Awaitable[None] | None:
-        """It is time to look; may be async."""
+        """Look at what is observed, as is done every so often; may be async."""
 
     def spares(self, grace: Grace, about: Literal) -> bool:
-        """Whether a grace is for what is said of this."""
+        """Say whether a grace is for what is said of this."""
         return not set(grace.names).isdisjoint(about.args)
 
     def afresh(self, names: Collection[str]) -> None:
@@ -108,12 +109,18 @@ class Observer(Actor):
         """Seconds since this observer began."""
         return self.now - self._began
 
-    def verdict(self, atom: Literal, holds: bool | None) -> None:
-        """One more sample: the atom holds, or does not, or (None) nothing is known."""
-        self.say(atom, None if holds is None else atom if holds else ~atom)
+    def verdict(self, atom: Literal | str, holds: bool | None) -> None:
+        """Take one more sample: the atom (`ok("disk")`, or "ok(disk)") holds, or does not, or (None) nothing is known.
 
-    def say(self, about: Literal, literal: Literal | None) -> None:
-        """One more sample of one thing of which different literals can be said, such as the trend of a value."""
+        Raises:
+            BadLiteral: the text is no atom. TypeError: it is neither an atom nor a text.
+        """
+        about = atom_of(atom)
+        self.say(about, None if holds is None else about if holds else ~about)
+
+    def say(self, about: Literal | str, literal: Literal | str | None) -> None:
+        """Take one more sample of something of which different literals can be said, such as the trend of a value."""
+        about, literal = literal_of(about), None if literal is None else literal_of(literal)
         word = self._words.get(about)
         if word is None:
             word = self._words[about] = _Word(self.manner.agreement)
@@ -121,9 +128,9 @@ class Observer(Actor):
         if settled is not None or literal is None or literal != word.said:  # What is seen again is not taken back.
             self._settle(word, settled)
 
-    def said(self, about: Literal) -> bool | None:
-        """What was settled of an atom: it holds, or does not, or (None) it is unknown."""
-        word = self._words.get(about)
+    def said(self, about: Literal | str) -> bool | None:
+        """Return what was settled of an atom: it holds, or does not, or (None) it is unknown."""
+        word = self._words.get(literal_of(about))
         settled = word.debounce.settled if word is not None else None
         return None if settled is None else settled.positive
 
@@ -136,6 +143,11 @@ class Observer(Actor):
             listen(self, topic)
         self.ctx.every(self.manner.every, Look())
         self.ctx.ref.tell(Look())
+
+    async def on_stop(self, reason: ExitReason) -> None:
+        """Tell the diagnoser of a crash."""
+        if isinstance(reason, Crash):
+            await self.ctx.publish(OBSERVERS, ObserverCrashed(self.ctx.path, str(reason)))
 
     @on(Heard)
     def _heard(self, message: Heard) -> Any:
@@ -185,11 +197,3 @@ class Observer(Actor):
         outbox, self._outbox = self._outbox, []
         for observation in outbox:
             await self.ctx.publish(OBSERVATIONS, observation)
-
-
-def atom_of(given: Literal | str) -> Literal:
-    """An atom, given as such or as text. Raises BadLiteral."""
-    literal = parse(given) if isinstance(given, str) else given
-    if not literal.positive:
-        raise BadLiteral(str(literal), "an observer is told of the atom; whether it holds is what it finds out")
-    return literal

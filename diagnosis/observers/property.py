@@ -21,10 +21,10 @@ from ...actors.errors import HoldfastError
 from ...actors.kernel.cell import Cell
 from ...actors.process.process_host import WorkerPlace
 from ...actors.process.wire.peer import OutsideHost
-from ..literals import Literal
+from ..literals import Literal, atom_of
 from ..messages import Grace
 from .node_observer import at_root
-from .observer import Manner, Observer, atom_of
+from .observer import Manner, Observer
 from .regression import Regression
 from .verdicts import Filter, Limits
 
@@ -33,7 +33,7 @@ PATIENCE: Final = 1.0
 
 
 class Property(enum.Enum):
-    """What can be measured of an actor."""
+    """The properties that can be measured of an actor and its process."""
 
     CPU = "cpu"
     """Percent of one core, of its process."""

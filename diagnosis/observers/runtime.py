@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple
 from ...actors.control.orders_lane import OrderAsk
 from ...actors.errors import ActorStopped, AskTimeout
 from ...actors.events import ActorCrashed, ChildTerminated, DeadLetter, EventStream
-from ...actors.exit_reasons import Crash, Normal
+from ...actors.exit_reasons import Crash, ExitReason, Normal
 from ...actors.kernel.address_host import Work
 from ...actors.kernel.cell import RUNNING, Cell
 from ...actors.kernel.envelope import Ask, chain_of
@@ -158,19 +158,13 @@ class RuntimeObserver(Observer):
         self._stream = self._node.events.listen()
         self._node.deadlines.watcher = self._note
 
-    def on_stop(self, reason: Any) -> None:
+    async def on_stop(self, reason: ExitReason) -> None:
         """Listen no more: it costs nothing from then on."""
-        self._end()
-
-    def on_restart(self, reason: Any) -> None:
-        """A life that has crashed listens no more."""
-        self._end()
-
-    def _end(self) -> None:
         if self._stream is not None:
             self._stream.close()
         if self._node.deadlines.watcher == self._note:
             self._node.deadlines.watcher = None
+        await super().on_stop(reason)
 
     @property
     def _node(self) -> Node:

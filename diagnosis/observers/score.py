@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection
 from typing import Any
 
-from ..literals import Literal, ok
-from .observer import Manner, Observer, atom_of
+from ..literals import Literal, atom_of, ok
+from .observer import Manner, Observer
 from .verdicts import Limits, Read, Smooth, reader
 
 

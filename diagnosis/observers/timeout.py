@@ -6,8 +6,8 @@ import math
 from collections.abc import Collection
 from typing import Any
 
-from ..literals import Literal, ok
-from .observer import Manner, Observer, atom_of
+from ..literals import Literal, atom_of, ok
+from .observer import Manner, Observer
 
 
 class TimeoutObserver(Observer):

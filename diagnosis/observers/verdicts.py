@@ -62,7 +62,7 @@ class Debounce(Generic[T]):
 
 
 class Limits(msgspec.Struct, frozen=True):
-    """What is good: above `low` and below `high`. What was bad is good again only `hysteresis` further in.
+    """Values that are good: above `low` and below `high`. One that was bad is good again only `hysteresis` further in.
 
     >>> limits = Limits(high=40.0, hysteresis=2.0)
     >>> limits.holds(39.0, True), limits.holds(39.0, False), limits.holds(37.0, False)
@@ -78,7 +78,7 @@ class Limits(msgspec.Struct, frozen=True):
             raise ValueError(f"nothing is between {self.low:g} and {self.high:g} with hysteresis {self.hysteresis:g}")
 
     def holds(self, value: float, was: bool | None = None) -> bool:
-        """Whether the value is good; `was` is the verdict before, if there is one."""
+        """Say whether the value is good; `was` is the verdict before, if there is one."""
         margin = self.hysteresis if was is False else 0.0
         return self.low + margin < value < self.high - margin
 

@@ -2,7 +2,9 @@
 
 Pure: observations, diagnosis and ledger in, problem out. Of several diagnoses the one is taken that was tried least in
 this case; then, that with the fewest components; then, that whose components were touched least; then the first by the
-engine's rank. So a diagnosis that did not help is not taken again before the others were (O3).
+engine's rank. So a diagnosis that did not help is not taken again before the others were (O3). Those of more components
+than one that was tried, and explains everything again, are not taken: that a repair has not helped is likelier than
+that so many are faulty at once.
 """
 
 from __future__ import annotations
@@ -70,7 +72,12 @@ def choose(
         return None
     if any(set(one.bad) <= set(given_up) for one in diagnosis.candidates):
         return None
-    open_ = [one for one in diagnosis.candidates if one.bad not in hopeless and not set(one.bad) <= set(alone)]
+    most = min((len(one.bad) for one in diagnosis.candidates if tried.get(one.bad)), default=math.inf)
+    open_ = [
+        one
+        for one in diagnosis.candidates
+        if len(one.bad) <= most and one.bad not in hopeless and not set(one.bad) <= set(alone)
+    ]
 
     def key(one: Candidate) -> tuple[int, int, int]:
         bad = [name for name in one.bad if name not in alone]
@@ -131,13 +138,7 @@ def components_of(goals: Collection[Goal]) -> tuple[str, ...]:
 
 def remaining(symptoms: Collection[Literal], observed: Observed) -> tuple[Literal, ...]:
     """The symptoms that are not seen to have gone: they still are, or nobody says anything of them any more."""
-    return tuple(one for one in symptoms if not _is_gone(one, observed))
-
-
-def _is_gone(symptom: Literal, observed: Observed) -> bool:
-    if symptom.positive:  # A trend gives way to another one: that it is not said any more is all that is to be seen.
-        return symptom not in observed.positive
-    return symptom.atom in observed.positive
+    return tuple(one for one in symptoms if not observed.has_gone(one))
 
 
 def symptoms_held(symptoms: Collection[Literal], observed: Observed) -> bool:

@@ -105,9 +105,9 @@ class Policy:
             raise ValueError(f"settle ({self.settle} s) must not be longer than verify ({self.verify} s)")
 
     def is_dangerous(self, action: str, is_marked: bool) -> bool:
-        """Whether a person has to approve an action; `is_marked`: the action itself says so."""
+        """Say whether a person has to approve an action; `is_marked`: the action itself says so."""
         return (is_marked or action in self.dangerous) and action not in self.allow
 
     def may(self, action: str, mode: str) -> bool:
-        """Whether an action may be done in a mode."""
+        """Say whether an action may be done in a mode."""
         return mode not in self.modes or action in self.modes[mode]

@@ -459,7 +459,8 @@ class Repairer(Actor):
         if self._memory.stance != "ask" and not any(map(self._is_dangerous, plan.steps)):
             return None
         what = ", ".join(map(str, plan.steps))
-        reason = f"{', '.join(bad)} {'is' if len(bad) == 1 else 'are'} diagnosed"
+        diagnosed = f"{', '.join(bad)} {'is' if len(bad) == 1 else 'are'} diagnosed"
+        reason = "; ".join((diagnosed, *filter(None, map(self._beyond, plan.steps))))
         wanted = say.ApprovalWanted(case.number, plan.steps, reason, policy.approval)
         why = await self._approvals.ask(wanted, self._tell, self._withdrawn(case, bad))
         if why is None and self._chosen(case) != bad:
@@ -546,6 +547,12 @@ class Repairer(Actor):
         found = reach(target) if reach is not None else None
         return found or self._addresses.get(target) or f"component {target}"
 
+    def _beyond(self, step: Step) -> str:
+        """Who else a step restarts, in words; empty if it touches nobody but its component."""
+        at, own = self._address(step), self._addresses.get(step.args[0] if step.args else "")
+        is_wide = self._actions[step.action].is_restart and own not in (None, at) and covers(at, own or "")
+        return f"{step.action} restarts {at} with all below it" if is_wide else ""
+
     async def _give_up(self, case: Case, components: Iterable[str], why: str) -> None:
         """Leave components alone from now on, and say so to everybody."""
         names = tuple(name for name in components if name not in self._memory.given_up)
@@ -570,7 +577,8 @@ class Repairer(Actor):
             for action in self._actions.actions.values():
                 step = Step(action.name, (name,))
                 if action.is_restart and action.takes(name) and step not in case.actions:
-                    yield str(step)
+                    beyond = self._beyond(step)
+                    yield f"{step}; {beyond}" if beyond else str(step)
         words = {
             word.source: word.literal
             for symptom in case.symptoms

@@ -4,11 +4,8 @@ from chapter_1 import Account, Balance
 
 import holdfast as hf
 from holdfast import diagnosis
-from holdfast.diagnosis import OBSERVATIONS, REPAIR
-from holdfast.diagnosis.model import System
-from holdfast.diagnosis.observations import Observation
-from holdfast.diagnosis.observers import GeneralObserver, Manner
-from holdfast.diagnosis.repair import Policy, Repaired
+from holdfast.diagnosis import OBSERVATIONS, REPAIR, GeneralObserver, Manner, Observation, Policy, System
+from holdfast.diagnosis.repair import Repaired
 
 
 class Rate(hf.Message):

@@ -13,7 +13,7 @@ from ...actors.values import encode_value
 
 
 class Application(msgspec.Struct, frozen=True):
-    """What a protected actor is like.
+    """The properties of a protected actor that mechanisms depend on.
 
     Args:
         name: of its class.
@@ -44,7 +44,7 @@ class Application(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, kind: type[Actor], *, sample: Any = None, **known: Any) -> Application:
-        """What a class says of itself.
+        """Read what a class says of itself.
 
         Determinism is its `deterministic`. Its state can be had unless it says `state_access = False`: by
         `get_state`/`set_state`, or as its key variables. `assertions` and `versions` are class attributes that list
@@ -74,11 +74,11 @@ class Application(msgspec.Struct, frozen=True):
 
     @property
     def saved_bytes(self) -> int:
-        """What has to be sent of the state after a request."""
+        """Return the bytes of the state that are to be sent after a request."""
         return self.delta_bytes if self.has_delta else self.state_bytes
 
     def lack(self, need: str) -> str:
-        """Why a need is not met, in words; empty if it is."""
+        """Say in words why a need is not met; empty if it is."""
         match need:
             case "determinism":
                 return "" if self.is_deterministic else f"{self.name or 'it'} says deterministic = False"

@@ -67,7 +67,7 @@ class Resources(msgspec.Struct, frozen=True):
     certificates: bool = False
 
     def scaled(self, factor: float) -> Resources:
-        """As if there were that many times as much of what is measured; units are counted, not measured."""
+        """Return that many times as much of what is measured; units are counted, not measured."""
         return msgspec.structs.replace(
             self, bandwidth=self.bandwidth * factor, cpu=self.cpu * factor, energy=self.energy * factor
         )

@@ -67,7 +67,7 @@ THRESHOLDS: Final = {
 
 
 class Settings(msgspec.Struct, frozen=True):
-    """How quick and how stubborn the monitoring engine is.
+    """The speed and the stubbornness of the monitoring engine.
 
     Args:
         required: faults to be tolerated whatever is seen.
@@ -103,7 +103,7 @@ class Settings(msgspec.Struct, frozen=True):
 
 
 class Readings(msgspec.Struct, frozen=True):
-    """What was measured; None for what cannot be."""
+    """Resources as they were measured; None for what cannot be."""
 
     units: int | None = None
     bandwidth: float | None = None
@@ -170,6 +170,8 @@ class Judge:
         resources: Resources | None = None,
         price: Pricing = resource_price,
     ) -> None:
+        if not callable(price):
+            raise TypeError(f"price is a function, such as response_price of holdfast.ftm, and not {price!r}")
         self.settings = settings
         self.application = application
         self.resources = Resources() if resources is None else resources

@@ -17,7 +17,6 @@ from collections.abc import Awaitable, Callable, Mapping
 from typing import Any, Final
 
 import msgspec
-import psutil
 
 from ...actors.events import Event, EventHub, EventStream
 from ...actors.exit_reasons import ExitReason
@@ -167,6 +166,8 @@ def read_machine() -> Readings:
 
     Bandwidth between units is not known here: pass a probe of your own that knows it.
     """
+    import psutil  # A program that is told its resources, or has no engine, does without it.
+
     battery: Any = psutil.sensors_battery() if hasattr(psutil, "sensors_battery") else None
     energy = None if battery is None else 1.0 if battery.power_plugged else battery.percent / 100
     idle = 1.0 - psutil.cpu_percent(interval=None) / 100

@@ -9,6 +9,7 @@ from ...actors.errors import SpecError
 from ...actors.kernel.node import cell_kind
 from ...supervision.spec import ChildSpec
 from ..model.application import Application
+from ..model.change_model import resource_price
 from ..model.composition import layers_of
 from ..model.mechanism import compose
 from .judge import Judge, Settings
@@ -16,7 +17,7 @@ from .monitor import ChangeStack, MechanismWatch
 
 if TYPE_CHECKING:
     from ...actors.kernel.ref import ActorRef
-    from ..model.change_model import Resources
+    from ..model.change_model import Pricing, Resources
     from ..model.mechanism import Mechanism
 
 PLAIN = ("pbr", "lfr", "tmr", "tr")
@@ -35,9 +36,10 @@ def watch_of(
     mechanisms: Iterable[Any] = PLAIN,
     resources: Resources | None = None,
     known: dict[str, Any] | None = None,
+    price: Pricing = resource_price,
     **options: Any,
 ) -> MechanismWatch:
-    """What a `MonitoringEngine` needs to look after an actor: it changes its mechanism by transactions.
+    """Describe to a `MonitoringEngine` how to look after an actor, whose mechanism it changes by transactions.
 
     Args:
         system: the system that it lives in.
@@ -47,10 +49,13 @@ def watch_of(
             actor has now are among them in any case.
         resources: what there is; measured, if it is left out.
         known: what is known of the application and its class does not say: `{"rate": 100.0}`.
+        price: what is to be small: `resource_price`, `response_price`, `recovery_price`, or a function of your own, as
+            in `select`.
         options: those of `MechanismWatch`: `probe`, `veto`, `degrade`, `signs`, `patience`.
 
     Raises:
         SpecError: no spec says what protects it: nobody supervises it. MechanismRefused: there is no such mechanism.
+        TypeError: `price` is no function.
     """
     cell = ref._cell
     kind, spec = cell_kind(cell), cell.spec
@@ -70,7 +75,7 @@ def watch_of(
     assertions = sum(len(getattr(one, "assertions", ())) for one in made.values())
     versions = sum(len(getattr(one, name, ())) for one in made.values() for name in BRINGS)
     application = Application.of(kind, **{"assertions": assertions, "versions": 1 + versions, **(known or {})})
-    judge = Judge(settings, application, tuple(one.name for one in present), list(made.values()), resources)
+    judge = Judge(settings, application, tuple(one.name for one in present), list(made.values()), resources, price)
     watch = MechanismWatch(ref.path, judge, change, **options)
     watch.kind = kind
     return watch

@@ -10,7 +10,7 @@ from holdfast.diagnosis.engine import Diagnoser, Diagnosis, State, minimal_diagn
 from holdfast.diagnosis.engine.cone import Index, RulePart, cone_of
 from holdfast.diagnosis.engine.solve import SearchBudget, Solved, solve
 from holdfast.diagnosis.literals import BadLiteral, Vocabulary, ok, parse, running
-from holdfast.diagnosis.model import History, Model, Put, System
+from holdfast.diagnosis.model import History, Model, Put, System, lint
 from holdfast.diagnosis.observations import Observation, ObservationSet
 from tests.diagnosis.robot import paper_robot
 
@@ -324,3 +324,18 @@ def test_clingo_writes_nothing(capfd: pytest.CaptureFixture[str]) -> None:
     system, symptoms = ladder(12)
     Diagnoser(system, seconds=0.01).diagnose_now(symptoms)
     assert capfd.readouterr() == ("", "")
+
+
+def test_literals_are_taken_as_text_wherever_they_are_taken() -> None:
+    shop = System()
+    shop.node("ledger", out=["/bookings"])
+    shop.expect(ok("disk"), of=["ledger"], given=[ok("/bookings")])
+    engine = Diagnoser(shop)
+    found = engine.diagnose_now(["not ok(disk)"])
+    assert found.suspects == ("ledger",)
+    assert engine.unseen(["ok(/bookings)"]) == (ok("disk"),)
+    assert engine.unseen(["not ok(/bookings)"]) == ()
+    engine.next_observations(["not ok(disk)"], found, can_be_seen=["ok(/bookings)"], costs={"ok(/bookings)": 2.0})
+    assert lint(Model(shop), ["ok(disk)"]) == lint(Model(shop), [ok("disk")])
+    with pytest.raises(BadLiteral, match="did you mean"):
+        lint(Model(shop), ["ok(disc)"])

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from tests.removing import Check, as_tests
 
+EVIDENCE = "tests/diagnosis/live/test_evidence.py"
 ENGINE = "tests/diagnosis/test_engine.py"
 OBSERVATIONS = "tests/diagnosis/test_observations.py"
 RUNTIME = "tests/diagnosis/observers/test_runtime.py"
@@ -25,6 +26,27 @@ KINDS = "tests/diagnosis/observers/test_kinds.py"
 PROGRAM_LINES = "tests/diagnosis/live/test_program_lines.py"
 
 CHECKS = {
+    "what is expected and nobody observes is unknown": Check(
+        "diagnosis/engine/minimal_diagnoses.py",
+        "        seen.difference_update(*(one.needs for one in self._unseen(positive, negative)))\n",
+        "",
+        EVIDENCE,
+        "nobody_observes",
+    ),
+    "who was suspected is unknown until that is seen to have gone": Check(
+        "diagnosis/doubts.py",
+        "if not observed.has_gone(symptom)}",
+        "if False}",
+        EVIDENCE,
+        "seen_to_have_gone",
+    ),
+    "an observer that crashes tells of it": Check(
+        "diagnosis/observers/observer.py",
+        "if isinstance(reason, Crash):",
+        "if False:",
+        EVIDENCE,
+        "crashes_is_named and always",
+    ),
     "what is seen again behind a grace is not taken back": Check(
         "diagnosis/observers/observer.py",
         "if settled is not None or literal is None or literal != word.said:",
@@ -265,8 +287,8 @@ CHECKS = {
     ),
     "a missing replica is no fault of the actor": Check(
         "diagnosis/generate.py",
-        "Expectation(str(atom(name)), (replicas_of(name),))",
-        "Expectation(str(atom(name)), (name,))",
+        "made(str(atom(name)), (replicas_of(name),))",
+        "made(str(atom(name)), (name,))",
         REPLICAS,
         "life_after_life",
     ),

@@ -109,3 +109,12 @@ async def test_what_mechanisms_bring_along_counts(system: hf.ActorSystem) -> Non
         watch_of(system, ref, CRASHES, mechanisms=("pbr", "nosuch"))
     with pytest.raises(hf.SpecError, match="not supervised"):
         watch_of(system, system.spawn(hf.start(Counter)), CRASHES)
+
+
+async def test_the_price_decides_between_those_that_are_valid(system: hf.ActorSystem) -> None:
+    ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=PBR()))
+    quick = watch_of(system, ref, CRASHES, mechanisms=("lfr",), resources=TWO, price=hf.ftm.response_price)
+    assert quick.judge.decide(0.0).target == ("lfr",)
+    assert watch_of(system, ref, CRASHES, mechanisms=("lfr",), resources=TWO).judge.decide(0.0).target is None
+    with pytest.raises(TypeError, match="such as response_price of holdfast"):
+        watch_of(system, ref, CRASHES, price="response")  # type: ignore[arg-type]

@@ -24,6 +24,14 @@ def test_what_was_tried_least_comes_first() -> None:
     assert chosen(tries={"a": 1}) == ("b",)
 
 
+def test_what_has_not_helped_is_likelier_than_that_more_are_faulty() -> None:
+    # Three sensors of which one differs from both others in each life: nobody restarts the two that agree.
+    odd = Diagnosis(State.FAULTY, ("a", "b", "c"), (Candidate(("a",)), Candidate(("b", "c"))), (~ok("/x"),))
+    assert chosen(odd, tried={("a",): 1}) == ("a",)
+    assert chosen(odd, tried={("a",): 1}, hopeless=[("a",)]) is None
+    assert chosen(odd, hopeless=[("a",)]) == ("b", "c")  # Nothing was tried: nothing speaks for it.
+
+
 def test_who_is_to_be_left_alone_is_not_chosen() -> None:
     # T64
     assert chosen(alone=["a"]) == ("b",)

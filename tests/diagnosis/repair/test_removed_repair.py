@@ -17,6 +17,13 @@ KILLS = "tests/checkpoint/test_kill_counts.py"
 HUNG = "tests/diagnosis/repair/test_hung_turns.py"
 
 CHECKS = {
+    "nobody else is restarted in place of one whose restart has not helped": Check(
+        "diagnosis/repair/choice.py",
+        "len(one.bad) <= most and ",
+        "",
+        "tests/diagnosis/repair/test_odd_one.py",
+        "",
+    ),
     "who hears nothing is killed": Check(
         "diagnosis/repair/stock.py",
         "blames_turn=True, at_once=is_silent)",
