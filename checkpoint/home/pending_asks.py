@@ -88,6 +88,7 @@ class SwitchAsk(RelayedAsk, eq=False):
     doubt: HoldfastError | None = None  # why nobody knows whether a life that has ended had handled it
     is_stranded: bool = False  # who is to answer has been stopped, and does so in its next life
     settled: Callable[[], None] | None = None  # called when its outcome is safe
+    hears: Callable[[BaseException | None], None] | None = None  # called with the error that it ends by, if any
 
     @classmethod
     def made(cls, switch: Switch, turn: int, out: Out, chain: Any, to: Cell, source: Input | None) -> SwitchAsk:
@@ -138,6 +139,14 @@ class SwitchAsk(RelayedAsk, eq=False):
                 self.fail(error)
                 return
         self.give(Answer(kind, name, body))
+
+    def failure(self, answer: Answer) -> BaseException | None:
+        """The error that an outcome is, if it is one."""
+        if answer.kind == GIVEN_UP:
+            return asyncio.CancelledError()
+        if answer.kind == REPLY:
+            return None
+        return self.codec.decode_error(answer.kind, answer.name, answer.body, *asked(self))
 
     def _is_asked_again(self, error: BaseException) -> bool:
         return self.out is not None and self.switch.homes.rejoin.next_lives.takes(self, error)
@@ -307,7 +316,18 @@ class PendingCalls:
             return
         source = home.ledger.open.get(key)
         home.node.emit(EffectRepeated(home.path, out.to, "" if source is None else source.name))
-        self.order(turn, out)
+        self.order(turn, out, is_again=(turn, out.k) not in self.effects or self.effects[turn, out.k].is_again)
+
+    def turn_begun(self) -> float | None:
+        """By when the turn in hand had begun, in whichever life, in Unix time; None if nothing says so.
+
+        What it waits for says since when, and what it has waited for, when that came.
+        """
+        ledger = self._home.ledger
+        turn = ledger.turn + 1
+        came = (ledger.outcomes.get((turn, k)) for k in range(1, len(ledger.released) + 1))
+        when = next((when for answer in came if answer is not None and (when := untimed(answer)[1])), None)
+        return min(filter(None, (when, *(rest.since for rest in self.resting()))), default=None)
 
     def resting(self) -> list[TurnRest]:
         """What the turn in hand waits for that is no other actor's work."""
@@ -345,16 +365,19 @@ class PendingCalls:
                 ask.tell_stranded()
                 self._home.homes.rejoin.next_lives.rest(ask)
 
-    def order(self, turn: int, out: Out) -> None:
-        """Have the present life perform an effect: all that precedes it is safe."""
+    def order(self, turn: int, out: Out, *, is_again: bool = False) -> None:
+        """Have the present life perform an effect: all that precedes it is safe.
+
+        `is_again`: it was out before, and since when is not known.
+        """
         place = turn, out.k
         if place not in self.effects:  # Else it is done again by a later life.
             if self.effects and next(iter(self.effects))[0] != turn:
                 self.long.clear()
                 self.effects.clear()  # An earlier turn has ended without waiting for them.
-            self.effects[place] = TurnRest("effect", out.to, self._home.node.clock.wall())
+            self.effects[place] = TurnRest("effect", out.to, self._home.node.clock.wall(), is_again=is_again)
         elif self.effects[place].failed:
-            self.effects[place] = TurnRest("effect", out.to, self.effects[place].since)
+            self.effects[place] = TurnRest("effect", out.to, self.effects[place].since, is_again=is_again)
         if self._home.life.port is not None:
             self._home.life.port.to_life(Perform(turn, out.k, self._home.life.token))
         self.long.discard(place)
@@ -418,6 +441,8 @@ class PendingCalls:
             if self._home.journal.durable:
                 self._home.note_shape(shape_name(answer), own)
             self._home.note(turn, outcome_entry(turn, k, kept), own)
+        if ask is not None and ask.hears is not None:
+            ask.hears(ask.failure(answer))
         told = came(answer) if kept is None else kept
         own.after.append(lambda: self._tell(turn, k, told))
         if ask is not None and ask.settled is not None:
@@ -429,6 +454,8 @@ class PendingCalls:
         """What is still out concerns nobody any more."""
         for ask in self.asks.values():
             ask.is_over, ask.future = True, OVER
+            if ask.hears is not None:
+                ask.hears(asyncio.CancelledError())
         self.asks.clear()
         self.effects.clear()
         self.long.clear()
