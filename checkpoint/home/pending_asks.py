@@ -22,6 +22,7 @@ from ...actors.events import EffectRepeated, EffectRetried
 from ...actors.kernel.cell import DOWN, Cell, TurnRest
 from ...actors.kernel.codec import Parcel
 from ...actors.kernel.envelope import NO_DEADLINE, Ask, ReplyHandle
+from ...actors.kernel.mailbox import BY_USER
 from ...actors.process.wire.peer import RelayedAsk, asked
 from ..inputs import Batch, Input
 from ..long_waits import LongWaits
@@ -174,6 +175,15 @@ class SwitchAsk(RelayedAsk, eq=False):
             return self.is_stranded
         cell: Cell | None = self.switch.node.find(self.out.to)
         return cell is not None and cell.state is DOWN and self.switch.homes.rejoin.next_lives.answers(cell)
+
+    @property
+    def is_stuck(self) -> bool:
+        """Whether it is answered only by the next life there, or by who is suspended, as far as that is known here."""
+        if self.has_nobody or self.out is None:
+            return self.has_nobody
+        cell: Cell | None = self.switch.node.find(self.out.to)
+        is_suspended = cell is not None and cell.more is not None and cell.more.suspended & BY_USER
+        return bool(is_suspended) and self.switch.homes.rejoin.next_lives.answers(cell)
 
     def drop(self) -> None:
         """Another ask stands in the place of this one, or the next program makes it again: it has no outcome here."""
@@ -347,8 +357,8 @@ class PendingCalls:
         return any(turn > self._home.ledger.turn for turn, _ in self.asks)
 
     def stranded(self) -> list[int]:
-        """Outputs of the turn in hand that are asks of somebody who has been stopped, and answers when it is back."""
-        return [k for (turn, k), ask in self.asks.items() if turn > self._home.ledger.turn and ask.has_nobody]
+        """Outputs of the turn in hand that are asks of somebody who is stopped or suspended, and answers after that."""
+        return [k for (turn, k), ask in self.asks.items() if turn > self._home.ledger.turn and ask.is_stuck]
 
     def note_unasked(self, ask: SwitchAsk, *, is_so: bool) -> None:
         """Have the next program know that surely nobody has handled an ask, or that from now on somebody may have."""
@@ -359,9 +369,9 @@ class PendingCalls:
             batch.commit(self._home.journal)
 
     def strand(self) -> None:
-        """The life is to end: the turn in hand does not wait for who is between two lives."""
+        """The life is to end: the turn in hand does not wait for who is between two lives, or suspended."""
         for (turn, _), ask in list(self.asks.items()):
-            if turn > self._home.ledger.turn and ask.has_nobody:
+            if turn > self._home.ledger.turn and ask.is_stuck:
                 ask.tell_stranded()
                 self._home.homes.rejoin.next_lives.rest(ask)
 
