@@ -147,7 +147,7 @@ CHECKS = {
     ),
     "what a recorded turn asks is below it": Check(
         "checkpoint/home/outputs.py",
-        "            chain = with_tail(chain, out.trace)",
+        "            chain = with_tail(chain, tail)",
         "            pass",
         TRACES,
         "test_what_a_recorded_turn_asks_is_below_it",
