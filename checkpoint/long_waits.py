@@ -31,8 +31,13 @@ def is_span(out: Out) -> bool:
     return (out.verb == "sleep" and out.to == SINCE_THEN) or (out.verb == "wait" and out.seconds > 0)
 
 
+def span_of(out: Out) -> float:
+    """Seconds after which a wait is over; 0.0 if it ends at a moment, or never."""
+    return out.seconds if is_span(out) else 0.0
+
+
 def due_entry(turn: int, k: int, when: float) -> Entry:
-    """What the journal has of until when output (turn, k) waits, in Unix time."""
+    """What the journal has of when the wait of output (turn, k) has begun: that moment and its span, in Unix time."""
     return "due", turn, k, when
 
 
@@ -59,12 +64,12 @@ class LongWaits:
         return bool(self.wanted)
 
     def fix(self, turn: int, out: Out, batch: Batch) -> None:
-        """Until when a turn waits is fixed when it first wants to, for all of its lives."""
+        """Since when and until when a turn waits is fixed when it first wants to, for all of its lives."""
+        home = self._home
         if is_span(out):
-            home = self._home
             self._ends[turn, out.k] = home.node.clock.passed() + out.seconds, False
-            when = home.ledger.waits.dues[turn, out.k] = home.node.clock.wall() + out.seconds
-            home.note(turn, due_entry(turn, out.k, when), batch)
+        when = home.ledger.waits.dues[turn, out.k] = home.node.clock.wall() + span_of(out)
+        home.note(turn, due_entry(turn, out.k, when), batch)
 
     def begin(self, turn: int, key: int, out: Out) -> None:
         """The turn with input `key` waits: until a moment, or for a message, for which there may be a time limit."""
@@ -81,10 +86,13 @@ class LongWaits:
         self._since = {known: when for known, when in self._since.items() if known[0] == turn}
         self._ends = {known: when for known, when in self._ends.items() if known[0] == turn}
         clock = self._home.node.clock
-        self._since.setdefault(place, clock.passed())
+        due = self._home.ledger.waits.dues.get(place)
+        if place not in self._since:
+            begun = clock.wall() if due is None else due - span_of(out)
+            self._since[place] = clock.passed() - max(0.0, clock.wall() - begun)
         if is_span(out):
             if place not in self._ends:  # Another program has begun to wait.
-                left = self._home.ledger.waits.dues.get(place, 0.0) - clock.wall()
+                left = (due or 0.0) - clock.wall()
                 self._ends[place] = clock.passed() + min(left, out.seconds), False
             self._look(place)
         elif not names:

@@ -453,7 +453,7 @@ class Status:
     turn: str | None
     """The message whose turn is not over, by type; seen only if the turn waits for something."""
     turn_seconds: float
-    """How long that turn has taken so far."""
+    """How long that turn has taken so far, over all lives it was handled in, as far as that is known."""
     links: int
     monitors: int
     """Who watches this actor."""
@@ -482,7 +482,7 @@ def status_of(cell: Cell) -> Status:
         cell.life,
         cell.host.backlog(cell),
         None if turn is None else type_name(type(message_in(item))),
-        0.0 if turn is None else cell.node.loop.time() - turn.since,
+        0.0 if turn is None else _turn_seconds(cell, cell.node.loop.time() - turn.since),
         0 if more is None else len(more.ties.links),
         0 if more is None else len(more.ties.monitors),
         os.getpid(),
@@ -509,8 +509,15 @@ def rests_said(cell: Cell) -> str:
 
 def known_at_home(status: Status, cell: Cell) -> Status:
     """A status with what the home of a recorded actor knows of its turn, and the process that it lives in does not."""
-    rests = rests_said(cell)
-    return dataclasses.replace(status, turn_rests=rests) if rests else status
+    rests = rests_said(cell) or status.turn_rests
+    seconds = 0.0 if status.turn is None else _turn_seconds(cell, status.turn_seconds)
+    return dataclasses.replace(status, turn_rests=rests, turn_seconds=seconds)
+
+
+def _turn_seconds(cell: Cell, seconds: float) -> float:
+    """How long the turn in hand has taken, which has been so many seconds in the present life."""
+    begun = cell.host.work(cell).begun
+    return seconds if begun is None else max(seconds, cell.node.clock.wall() - begun)
 
 
 def _state(cell: Cell) -> str:

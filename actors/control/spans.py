@@ -154,11 +154,15 @@ class Spans:
         elif around and not _is_sampled(trace.get_current_span(around).get_span_context()):
             tail = self.tail(SpanContext(0, 0, is_remote=False), around)
         else:
-            span = self.begin("ask", SpanKind.CLIENT, ask.to, ask.brings(), around)
+            span, tail = self.ask_span(ask.to, ask.brings(), around)
             ask.future.add_done_callback(functools.partial(_outcome, span))
-            tail = self.tail(span.get_span_context(), around)
         ask.chain = with_tail(ask.chain, tail) if ask.chain else ((tail, 0),)
         follow(ask)
+
+    def ask_span(self, to: Cell, message: str, around: otel.Context) -> tuple[Span, str]:
+        """The span of an ask, and what goes along with the message."""
+        span = self.begin("ask", SpanKind.CLIENT, to, message, around)
+        return span, self.tail(span.get_span_context(), around)
 
     def outgoing(self, cell: Cell, item: Any) -> Any:
         """What is sent in place of an ask, a message or an envelope: one that has its trace, if it belongs to one."""
@@ -414,9 +418,27 @@ class _Turn(NamedTuple):
 
 def _outcome(span: Span, done: Any) -> None:
     """The ask has its outcome, or nobody waits for it any more."""
-    if done.cancelled():
+    answered(span, asyncio.CancelledError() if done.cancelled() else done.exception())
+
+
+def answered(span: Span, error: BaseException | None) -> None:
+    """End the span of an ask: it was answered, or has failed by this error."""
+    if isinstance(error, asyncio.CancelledError):
         span.set_status(Status(StatusCode.ERROR, "cancelled"))
-    elif (error := done.exception()) is not None:
+    elif error is not None:
         span.set_attribute("error.type", type_name(type(error)))
         span.set_status(Status(StatusCode.ERROR, str(error)))
     end(span)
+
+
+def ask_of_turn(node: Node, to: Cell, message: str, tail: str) -> tuple[str, Callable[[BaseException | None], None]]:
+    """Make the span of an ask that a turn makes which was sent this trace; the home of that turn makes it.
+
+    Returns:
+        what goes along with the ask, and what is called with its outcome.
+    """
+    spans = spans_of(node)
+    if spans is None or tail.startswith(NO_TRACE):
+        return tail, lambda error: None
+    span, onward = spans.ask_span(to, message, context_of(tail))
+    return onward, functools.partial(answered, span)

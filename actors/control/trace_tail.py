@@ -17,7 +17,9 @@ import msgspec
 from ..kernel.envelope import Chain, Envelope, waiters
 
 if TYPE_CHECKING:
+    from ..kernel.cell import Cell
     from ..kernel.envelope import Item
+    from ..kernel.node import Node
 
 
 def tail_of(chain: Chain) -> str:
@@ -77,6 +79,13 @@ def _traced_class(kind: type[Item]) -> Any:
     else:
         space["__slots__"] = cast("Any", ())
     return types.new_class(f"Traced{kind.__name__}", (kind,), options, lambda made: made.update(space))
+
+
+def ask_of_turn(node: Node, to: Cell, message: str, tail: str) -> tuple[str, Callable[[BaseException | None], None]]:
+    """Make the span of an ask whose turn is in this trace: what goes along with it, and what hears its outcome."""
+    from .spans import ask_of_turn
+
+    return ask_of_turn(node, to, message, tail)
 
 
 @functools.cache

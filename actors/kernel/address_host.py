@@ -34,6 +34,7 @@ class Work(NamedTuple):
         own_turns: times its process was seen to have got on, by turns that the home knows nothing of, too (of timers,
             say); it is as new as the last answer to `Home.ask_turns`.
         newest: the ask that `has_answered` is about, if that is known as such.
+        begun: by when that turn had begun, in Unix time and in whichever life; None if nothing says so.
     """
 
     mark: object = None
@@ -42,6 +43,7 @@ class Work(NamedTuple):
     has_answered: bool = False
     own_turns: int = 0
     newest: object = None
+    begun: float | None = None
 
 
 class Capacity(Protocol):

@@ -182,6 +182,7 @@ class TurnRest(NamedTuple):
         attempts: how many there may be.
         error: what the last one has raised, in a line.
         again: when the next one begins, or has begun, in Unix time.
+        is_again: of an effect, that it was out in an earlier program, too; `since` is when this one has begun it.
     """
 
     kind: Literal["sleep", "effect", "wait"]
@@ -192,6 +193,7 @@ class TurnRest(NamedTuple):
     attempts: int = 0
     error: str = ""
     again: float = 0.0
+    is_again: bool = False
 
     def after(self, failed: FailedAttempt, now: float) -> TurnRest:
         """The same, when an attempt of the effect has failed at this moment, in Unix time."""
@@ -205,7 +207,8 @@ class TurnRest(NamedTuple):
         """
         seconds = now - self.since
         if self.kind == "effect":
-            return f"waits for the effect {self.name}, which has been out for {seconds:.1f} s{self._tried(now)}"
+            out = "was out before, and has been out again" if self.is_again else "has been out"
+            return f"waits for the effect {self.name}, which {out} for {seconds:.1f} s{self._tried(now)}"
         if self.kind == "wait":
             said = f"has waited for {seconds:.1f} s for {self.name}"
             return said if self.until is None else f"{said}, until {_moment(self.until, now)} at the latest"

@@ -82,7 +82,7 @@ class LedgerWaits:
     Attributes:
         heard: how many outcomes it has.
         lasts: whether it has had effects or long waits: it goes on in the next life at its address.
-        dues: until when outputs of it wait, in Unix time.
+        dues: until when outputs of it wait, in Unix time; of one that waits until a moment, or for ever, since when.
         unasked: asks among them that surely nobody has handled: who was to was stopped with the program.
     """
 

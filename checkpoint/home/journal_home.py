@@ -255,18 +255,20 @@ class JournalHome(RecordedHome):
         return self.switch is not None and self.switch.life.is_released
 
     def backlog(self, cell: Cell, running: int) -> int:
-        return 0 if self.switch is None else self.switch.ledger.backlog(running)
+        return 0 if self.switch is None else self.switch.ledger.backlog(self.switch.in_hand(running))
 
     def work(self, cell: Cell, running: int) -> Work:
         """The input in hand, or the number of the turn that has ended last: the same for every place."""
         switch = self.switch
         if switch is None:
             return Work()
-        source, turn = switch.ledger.open.get(running), cell.more.turn if cell.more is not None else None
+        source = switch.ledger.open.get(switch.in_hand(running))
+        turn = cell.more.turn if cell.more is not None else None
         mark: object = switch.ledger.turn if source is None else source
         ended = switch.ledger.turns.get(switch.ledger.turn)
         has_answered = ended is not None and bool(ended.reply) and ended.input.ask is None  # Else it is to come later.
-        return Work(mark, source is not None, None if turn is None else turn.since, has_answered)
+        since, begun = None if turn is None else turn.since, None if source is None else switch.calls.turn_begun()
+        return Work(mark, source is not None, since, has_answered, begun=begun)
 
     def rests(self, cell: Cell) -> list[TurnRest]:
         return [] if self.switch is None else self.switch.calls.resting()

@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any
 
-from ...actors.control.trace_tail import enveloped, follow, with_tail
+from ...actors.control.trace_tail import ask_of_turn, enveloped, follow, with_tail
 from ...actors.errors import AskDeadlock, HoldfastError, MailboxFull
 from ...actors.kernel.cell import DOWN, GONE, Cell
 from ...actors.kernel.codec import Parcel
@@ -66,7 +66,8 @@ class Outputs:
                 self._ask(turn, key, out, batch)
             case "effect" | "sleep" | "wait":
                 home.ledger.waits.lasts = True
-                home.calls.rests.fix(turn, out, batch)
+                if out.verb != "effect":
+                    home.calls.rests.fix(turn, out, batch)
                 port = home.life.port
                 batch.after.append(lambda: self._begin(turn, key, out, port))
             case "publish":
@@ -328,9 +329,12 @@ class Outputs:
         """The ask that is an output of the turn in hand, which waits for it from now on."""
         home, source = self._home, self._home.ledger.open.get(key)
         chain = ((home.path, key), *(source.chain if source is not None else ()))
+        hears = None
         if out.trace:
-            chain = with_tail(chain, out.trace)
+            tail, hears = ask_of_turn(home.node, target, out.name.replace(":", "."), out.trace)
+            chain = with_tail(chain, tail)
         ask = SwitchAsk.made(home, turn, out, chain, target, source)
+        ask.hears = hears
         home.calls.asks[turn, out.k] = ask
         home.node.deadlines.add(ask)
         return ask
@@ -345,7 +349,7 @@ class Outputs:
         assert ask.out is not None
         ask.drop()
         again = SwitchAsk.made(self._home, ask.turn, ask.out, ask.chain, ask.target, None)
-        again.since, again.doubt = ask.since, ask.doubt
+        again.since, again.doubt, again.hears = ask.since, ask.doubt, ask.hears
         self._home.calls.asks[ask.turn, ask.k] = again
         self._home.node.deadlines.add(again)
         return again

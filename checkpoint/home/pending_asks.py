@@ -22,6 +22,7 @@ from ...actors.events import EffectRepeated, EffectRetried
 from ...actors.kernel.cell import DOWN, Cell, TurnRest
 from ...actors.kernel.codec import Parcel
 from ...actors.kernel.envelope import NO_DEADLINE, Ask, ReplyHandle
+from ...actors.kernel.mailbox import BY_USER
 from ...actors.process.wire.peer import RelayedAsk, asked
 from ..inputs import Batch, Input
 from ..long_waits import LongWaits
@@ -88,6 +89,7 @@ class SwitchAsk(RelayedAsk, eq=False):
     doubt: HoldfastError | None = None  # why nobody knows whether a life that has ended had handled it
     is_stranded: bool = False  # who is to answer has been stopped, and does so in its next life
     settled: Callable[[], None] | None = None  # called when its outcome is safe
+    hears: Callable[[BaseException | None], None] | None = None  # called with the error that it ends by, if any
 
     @classmethod
     def made(cls, switch: Switch, turn: int, out: Out, chain: Any, to: Cell, source: Input | None) -> SwitchAsk:
@@ -139,6 +141,14 @@ class SwitchAsk(RelayedAsk, eq=False):
                 return
         self.give(Answer(kind, name, body))
 
+    def failure(self, answer: Answer) -> BaseException | None:
+        """The error that an outcome is, if it is one."""
+        if answer.kind == GIVEN_UP:
+            return asyncio.CancelledError()
+        if answer.kind == REPLY:
+            return None
+        return self.codec.decode_error(answer.kind, answer.name, answer.body, *asked(self))
+
     def _is_asked_again(self, error: BaseException) -> bool:
         return self.out is not None and self.switch.homes.rejoin.next_lives.takes(self, error)
 
@@ -165,6 +175,15 @@ class SwitchAsk(RelayedAsk, eq=False):
             return self.is_stranded
         cell: Cell | None = self.switch.node.find(self.out.to)
         return cell is not None and cell.state is DOWN and self.switch.homes.rejoin.next_lives.answers(cell)
+
+    @property
+    def is_stuck(self) -> bool:
+        """Whether it is answered only by the next life there, or by who is suspended, as far as that is known here."""
+        if self.has_nobody or self.out is None:
+            return self.has_nobody
+        cell: Cell | None = self.switch.node.find(self.out.to)
+        is_suspended = cell is not None and cell.more is not None and cell.more.suspended & BY_USER
+        return bool(is_suspended) and self.switch.homes.rejoin.next_lives.answers(cell)
 
     def drop(self) -> None:
         """Another ask stands in the place of this one, or the next program makes it again: it has no outcome here."""
@@ -307,7 +326,18 @@ class PendingCalls:
             return
         source = home.ledger.open.get(key)
         home.node.emit(EffectRepeated(home.path, out.to, "" if source is None else source.name))
-        self.order(turn, out)
+        self.order(turn, out, is_again=(turn, out.k) not in self.effects or self.effects[turn, out.k].is_again)
+
+    def turn_begun(self) -> float | None:
+        """By when the turn in hand had begun, in whichever life, in Unix time; None if nothing says so.
+
+        What it waits for says since when, and what it has waited for, when that came.
+        """
+        ledger = self._home.ledger
+        turn = ledger.turn + 1
+        came = (ledger.outcomes.get((turn, k)) for k in range(1, len(ledger.released) + 1))
+        when = next((when for answer in came if answer is not None and (when := untimed(answer)[1])), None)
+        return min(filter(None, (when, *(rest.since for rest in self.resting()))), default=None)
 
     def resting(self) -> list[TurnRest]:
         """What the turn in hand waits for that is no other actor's work."""
@@ -327,8 +357,8 @@ class PendingCalls:
         return any(turn > self._home.ledger.turn for turn, _ in self.asks)
 
     def stranded(self) -> list[int]:
-        """Outputs of the turn in hand that are asks of somebody who has been stopped, and answers when it is back."""
-        return [k for (turn, k), ask in self.asks.items() if turn > self._home.ledger.turn and ask.has_nobody]
+        """Outputs of the turn in hand that are asks of somebody who is stopped or suspended, and answers after that."""
+        return [k for (turn, k), ask in self.asks.items() if turn > self._home.ledger.turn and ask.is_stuck]
 
     def note_unasked(self, ask: SwitchAsk, *, is_so: bool) -> None:
         """Have the next program know that surely nobody has handled an ask, or that from now on somebody may have."""
@@ -339,22 +369,25 @@ class PendingCalls:
             batch.commit(self._home.journal)
 
     def strand(self) -> None:
-        """The life is to end: the turn in hand does not wait for who is between two lives."""
+        """The life is to end: the turn in hand does not wait for who is between two lives, or suspended."""
         for (turn, _), ask in list(self.asks.items()):
-            if turn > self._home.ledger.turn and ask.has_nobody:
+            if turn > self._home.ledger.turn and ask.is_stuck:
                 ask.tell_stranded()
                 self._home.homes.rejoin.next_lives.rest(ask)
 
-    def order(self, turn: int, out: Out) -> None:
-        """Have the present life perform an effect: all that precedes it is safe."""
+    def order(self, turn: int, out: Out, *, is_again: bool = False) -> None:
+        """Have the present life perform an effect: all that precedes it is safe.
+
+        `is_again`: it was out before, and since when is not known.
+        """
         place = turn, out.k
         if place not in self.effects:  # Else it is done again by a later life.
             if self.effects and next(iter(self.effects))[0] != turn:
                 self.long.clear()
                 self.effects.clear()  # An earlier turn has ended without waiting for them.
-            self.effects[place] = TurnRest("effect", out.to, self._home.node.clock.wall())
+            self.effects[place] = TurnRest("effect", out.to, self._home.node.clock.wall(), is_again=is_again)
         elif self.effects[place].failed:
-            self.effects[place] = TurnRest("effect", out.to, self.effects[place].since)
+            self.effects[place] = TurnRest("effect", out.to, self.effects[place].since, is_again=is_again)
         if self._home.life.port is not None:
             self._home.life.port.to_life(Perform(turn, out.k, self._home.life.token))
         self.long.discard(place)
@@ -418,6 +451,8 @@ class PendingCalls:
             if self._home.journal.durable:
                 self._home.note_shape(shape_name(answer), own)
             self._home.note(turn, outcome_entry(turn, k, kept), own)
+        if ask is not None and ask.hears is not None:
+            ask.hears(ask.failure(answer))
         told = came(answer) if kept is None else kept
         own.after.append(lambda: self._tell(turn, k, told))
         if ask is not None and ask.settled is not None:
@@ -429,6 +464,8 @@ class PendingCalls:
         """What is still out concerns nobody any more."""
         for ask in self.asks.values():
             ask.is_over, ask.future = True, OVER
+            if ask.hears is not None:
+                ask.hears(asyncio.CancelledError())
         self.asks.clear()
         self.effects.clear()
         self.long.clear()

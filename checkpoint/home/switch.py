@@ -443,6 +443,10 @@ class Switch:
         """Whether the turn of this input waits until a moment or for a message: for days, if that is wanted."""
         return running == self.ledger.begun and self.calls.rests.is_busy
 
+    def in_hand(self, running: int) -> int:
+        """The input in hand; -1: none. `running` is what the life's place says, which knows of no turn that rests."""
+        return self.ledger.begun if running < 0 and self.calls.rests.is_busy else running
+
     # -- what the life says -----------------------------------------------------------------------------------------
 
     def from_life(self, record: ToHome) -> None:

@@ -22,11 +22,11 @@ from .reaching import (
     Json,
     OnePath,
     Paths,
+    Patterned,
     Socket,
     System,
     Timeout,
     Yes,
-    complete_path,
     confirm,
     ended,
     meant_rows,
@@ -231,9 +231,7 @@ def unbind(
 
 
 def protect(
-    path: Annotated[
-        str, typer.Argument(metavar="PATH", help="Actors, as in all commands.", autocompletion=complete_path)
-    ],
+    path: Patterned,
     mechanisms: Annotated[
         list[str] | None,
         typer.Argument(metavar="[MECHANISM]...", help="Outermost first: pbr, lfr, tr, or a file that defines one."),

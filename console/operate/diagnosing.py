@@ -12,7 +12,7 @@ from typing import Annotated, Any, Final
 import msgspec
 import typer
 
-from .reaching import FAILED, Json, Socket, System, complete_path, ended, reached, show_json
+from .reaching import FAILED, ONE, Json, Socket, System, address_of, alone, complete_path, ended, reached, show_json
 from .remembering import print_lines
 from .told_lines import moment
 
@@ -21,7 +21,7 @@ def diagnose(
     path: Annotated[
         str | None,
         typer.Argument(
-            metavar="[PATH]", help="Only suspects at this address and below it.", autocompletion=complete_path
+            help=f"{ONE}; only suspects there and below are told.", autocompletion=complete_path, callback=alone
         ),
     ] = None,
     system: System = None,
@@ -42,6 +42,7 @@ def diagnose(
     last: list[dict[str, Any]] | None = None
     try:
         with reached("diagnose", system, socket) as remote, asyncio.Runner() as runner:
+            path = path and address_of(remote, path)
             while True:
                 found = runner.run(remote.diagnosis(path, timeout=timeout))
                 if png is not None:

@@ -21,9 +21,10 @@ from .reaching import (
     UNUSABLE,
     Json,
     OnePath,
+    Patterned,
     Socket,
     System,
-    complete_path,
+    address_of,
     ended,
     meant_rows,
     reached,
@@ -96,10 +97,7 @@ def trace(
 
 
 def logs(
-    path: Annotated[
-        str,
-        typer.Argument(help="An address, a name, or a pattern such as '/app/bank/**'.", autocompletion=complete_path),
-    ] = "**",
+    path: Patterned = "**",
     system: System = None,
     socket: Socket = None,
     follow: Annotated[
@@ -120,7 +118,7 @@ def logs(
     """
     begin = begin_meant("logs", since)
     with reached("logs", system, socket) as remote, contextlib.suppress(KeyboardInterrupt):
-        path = _address_of(remote, path)
+        path = address_of(remote, path)
         page = remote.logs(path, level=level.value, since=begin, limit=last)
         print_log(page.lines, as_json=as_json)
         if not page.lines and not follow:
@@ -131,11 +129,6 @@ def logs(
                 if page.dropped:
                     typer.echo(f"{page.dropped} lines came too fast and are not shown", err=True)
                 print_log(page.lines, as_json=as_json)
-
-
-def _address_of(remote: RemoteSystem, path: str) -> str:
-    """The address of the actor with this name; an address or a pattern as it is."""
-    return path if path.startswith("/") or {*"*?["} & {*path} else remote.whereis(path).path
 
 
 def why_empty(remote: RemoteSystem, path: str) -> None:

@@ -6,7 +6,7 @@ import dataclasses
 import fnmatch
 import operator
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from typing import Any, Final
 
 from ...actors.errors import HoldfastError, NoSuchActor
@@ -117,6 +117,13 @@ def _values(row: ActorRow) -> tuple[Any, ...]:
     return tuple(getattr(row, name) for name in row.__struct_fields__)
 
 
+def refuse_address(pattern: Pattern, addresses: Collection[str]) -> None:
+    """Have a pattern mean no others while somebody has that very address. Raises BadPattern."""
+    if pattern.one is None and pattern.text in addresses:
+        problem = f"an actor has this very address; to mean it alone write '{literal(pattern.text)}'"
+        raise BadPattern(pattern.text, problem)
+
+
 def select(rows: Iterable[ActorRow], texts: Iterable[str]) -> list[ActorRow]:
     """Those that are meant, each once, in the order of the rows.
 
@@ -127,9 +134,7 @@ def select(rows: Iterable[ActorRow], texts: Iterable[str]) -> list[ActorRow]:
     known, wanted = list(rows), [read_pattern(text) for text in texts]
     addresses = {row.path for row in known}
     for pattern in wanted:
-        if pattern.one is None and pattern.text in addresses:
-            problem = f"an actor has this very address; to mean it alone write '{literal(pattern.text)}'"
-            raise BadPattern(pattern.text, problem)
+        refuse_address(pattern, addresses)
         if not any(pattern.matches(row) for row in known):
             raise NoSuchActor(pattern.text)
     return [row for row in known if any(pattern.matches(row) for pattern in wanted)]

@@ -135,10 +135,15 @@ Paths = Annotated[
     list[str],
     typer.Argument(
         metavar="PATH...",
-        help="Addresses, names, or patterns such as '/app/**[restarts>3]'.",
+        help="Addresses, names or patterns, such as '/app/**[restarts>3]'.",
         autocompletion=complete_path,
     ),
 ]
+
+
+WHOSE = "An address, a name, or a pattern such as '/app/bank/**'"
+Patterned = Annotated[str, typer.Argument(help=f"{WHOSE}.", autocompletion=complete_path)]
+ONE = "One actor: its address or its name"
 
 
 def alone(path: str | None) -> str | None:
@@ -148,13 +153,13 @@ def alone(path: str | None) -> str | None:
 
 OnePath = Annotated[
     str,
-    typer.Argument(metavar="PATH", help="An address or a name.", autocompletion=complete_path, callback=alone),
+    typer.Argument(metavar="PATH", help=f"{ONE}.", autocompletion=complete_path, callback=alone),
 ]
 
 
 RootOrOne = Annotated[
     str | None,
-    typer.Argument(metavar="PATH", help="An address or a name.", autocompletion=complete_path, callback=alone),
+    typer.Argument(metavar="PATH", help=f"{ONE}.", autocompletion=complete_path, callback=alone),
 ]
 
 
@@ -225,6 +230,11 @@ def reached(command: str, system: str | None, socket: Path | None) -> Generator[
     with told(command), RemoteSystem(chosen(system, socket)) as remote:
         remote.greet(GREETING_SECONDS)
         yield remote
+
+
+def address_of(remote: RemoteSystem, path: str) -> str:
+    """The address of the actor with this name; an address or a pattern as it is. Raises NoSuchActor."""
+    return path if path.startswith("/") or {*"*?["} & {*path} else remote.whereis(path).path
 
 
 def no_pattern(path: str) -> str:

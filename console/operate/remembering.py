@@ -18,9 +18,11 @@ from .reaching import (
     UNUSABLE,
     Json,
     OnePath,
+    Patterned,
     RootOrOne,
     Socket,
     System,
+    address_of,
     ended,
     no_pattern,
     printable,
@@ -34,13 +36,11 @@ ONE_LOOK = 30.0
 KINDS = frozenset(events_of_all.__all__) | {"SystemStarted", "SystemStopped", "EventsLeftOut"}
 """The names of the events that there are."""
 
-Pattern = Annotated[str, typer.Argument(help="An address, or a pattern such as '/app/bank/**'.")]
-
 
 def why(path: RootOrOne = None, system: System = None, socket: Socket = None, as_json: Json = False) -> None:
     """Say in a few sentences why an actor restarts, has ended, or does not get on; left out, the root is meant."""
     with reached("why", system, socket) as remote:
-        path = path or f"/{remote.about()['name']}"
+        path = address_of(remote, path or f"/{remote.about()['name']}")
         sentences = asyncio.run(remote.why(path))
         if not remote.lives(path) and path not in remote.tree():
             raise ended("why", " ".join(sentences) + no_pattern(path), FAILED)
@@ -53,6 +53,7 @@ def why(path: RootOrOne = None, system: System = None, socket: Socket = None, as
 def history(path: OnePath, system: System = None, socket: Socket = None, as_json: Json = False) -> None:
     """List the last lives of an actor: when each began and ended, why, and by whom."""
     with reached("history", system, socket) as remote:
+        path = address_of(remote, path)
         lives = remote.lives(path)
         if not lives:
             raise ended("history", f"the history knows of no life at {path}{no_pattern(path)}", FAILED)
@@ -63,7 +64,7 @@ def history(path: OnePath, system: System = None, socket: Socket = None, as_json
 
 
 def events(
-    path: Pattern = "**",
+    path: Patterned = "**",
     system: System = None,
     socket: Socket = None,
     kinds: Annotated[list[str] | None, typer.Option("--kind", help="Only this kind of event; may be repeated.")] = None,
@@ -81,6 +82,7 @@ def events(
     begin = begin_meant("events", since)
     try:
         with reached("events", system, socket) as remote:
+            path = address_of(remote, path)
             page = remote.history(path, kinds=kinds or (), since=begin, limit=last)
             _print_events(page.events, as_json=as_json)
             if not page.events and not follow and not as_json:
@@ -94,7 +96,7 @@ def events(
 
 
 def dead_letters(
-    path: Pattern = "**",
+    path: Patterned = "**",
     system: System = None,
     socket: Socket = None,
     last: Last = 50,
@@ -104,6 +106,7 @@ def dead_letters(
     """Print the messages that nobody handled, or that were refused: type, sender, and why."""
     begin = begin_meant("dead-letters", since)
     with reached("dead-letters", system, socket) as remote:
+        path = address_of(remote, path)
         page = remote.history(path, kinds=["DeadLetter"], since=begin, limit=last)
     _print_events(page.events, as_json=as_json)
     if not page.events and not as_json:

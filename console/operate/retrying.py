@@ -8,10 +8,15 @@ import msgspec
 import typer
 from typer.core import TyperGroup
 
+from ...actors.errors import SpecError
+from ...system.history.evidence import PutAside
 from ..remote import RemoteSystem
+from .patterns import read_pattern, refuse_address
 from .reaching import (
     FAILED,
+    WHOSE,
     Json,
+    Patterned,
     Socket,
     System,
     Yes,
@@ -52,13 +57,23 @@ quarantine = typer.Typer(
     add_completion=False,
 )
 
-Address = Annotated[str, typer.Argument(metavar="PATH", help="An address.", autocompletion=complete_path)]
+
+def put_aside_of(remote: RemoteSystem, path: str | None) -> list[PutAside]:
+    """What is in quarantine of those who are meant; they need not be there any more. Raises BadPattern."""
+    found = remote.put_aside()
+    if path is None:
+        return found
+    pattern, rows = read_pattern(path), remote.look().rows
+    refuse_address(pattern, {row.path for row in rows} | {one.address for one in found})
+    there = {row.path for row in rows if pattern.matches(row)}
+    is_like = pattern.is_like if not pattern.conditions else there.__contains__
+    return [one for one in found if one.address in there or is_like(one.address)]
 
 
 def complete_id(ctx: typer.Context, incomplete: str) -> list[str]:
     """The ids of what is in quarantine at the address that was typed, for the shell."""
     path: str | None = ctx.params.get("path")
-    return complete(ctx, incomplete, lambda remote: [str(one.id) for one in remote.put_aside(path)])
+    return complete(ctx, incomplete, lambda remote: [str(one.id) for one in put_aside_of(remote, path)])
 
 
 Id = Annotated[
@@ -76,7 +91,7 @@ Id = Annotated[
 @quarantine.command(LISTING, hidden=True)
 def list_quarantine(
     path: Annotated[
-        str | None, typer.Argument(help="An address; without one, of all.", autocompletion=complete_path)
+        str | None, typer.Argument(help=f"{WHOSE}; without one, of all.", autocompletion=complete_path)
     ] = None,
     system: System = None,
     socket: Socket = None,
@@ -87,7 +102,7 @@ def list_quarantine(
     Exit status 0: done, also if there is none. 2: no system answers.
     """
     with reached("quarantine", system, socket) as remote:
-        messages = remote.put_aside(path)
+        messages = put_aside_of(remote, path)
     if as_json:
         show_json({"quarantine": msgspec.to_builtins(messages)})
     else:
@@ -95,32 +110,56 @@ def list_quarantine(
 
 
 @quarantine.command()
-def retry(path: Address, id: Id = None, system: System = None, socket: Socket = None, as_json: Json = False) -> None:
+def retry(path: Patterned, id: Id = None, system: System = None, socket: Socket = None, as_json: Json = False) -> None:
     """Have messages in quarantine handled as if they had come now. Who had asked has long got `Quarantined`.
 
     Exit status 0: done. 1: nothing is there, or one could not be retried; the others were. 2: no system answers.
     """
     with reached("quarantine retry", system, socket) as remote:
-        _settle(remote, "retry", path, id, as_json)
+        _settle(remote, "retry", _meant(remote, path, id), as_json)
 
 
 @quarantine.command()
 def drop(
-    path: Address, id: Id = None, system: System = None, socket: Socket = None, yes: Yes = False, as_json: Json = False
+    path: Patterned,
+    id: Id = None,
+    system: System = None,
+    socket: Socket = None,
+    yes: Yes = False,
+    as_json: Json = False,
 ) -> None:
     """Forget messages in quarantine: they become dead letters. You are asked before.
 
     Exit status 0: done. 1: nothing is there, or one could not be dropped; the others were. 2: no system answers.
     """
     with reached("quarantine drop", system, socket) as remote:
-        meant = [one for one in remote.put_aside(path) if id in (None, one.id)]
+        meant = _meant(remote, path, id)
         confirm("quarantine drop", [f"this is dropped: {quarantine_line(one)}" for one in meant], yes=yes)
-        _settle(remote, "drop", path, id, as_json)
+        _settle(remote, "drop", meant, as_json)
 
 
-def _settle(remote: RemoteSystem, verb: Literal["retry", "drop"], path: str, id: int | None, as_json: bool) -> None:
-    """Have it done, and show for which messages it was done."""
-    done, failed = remote.settle_put_aside(verb, path, id)
+def _meant(remote: RemoteSystem, path: str, id: int | None) -> list[PutAside]:
+    """The messages that are meant. Raises SpecError: there is none, or the number may be that of several actors."""
+    found = put_aside_of(remote, path)
+    if id is not None and len({one.address for one in found}) > 1:
+        raise SpecError(path, f"several actors are meant, each of which may have a message {id}: write an address")
+    meant = [one for one in found if id in (None, one.id)]
+    if not meant:
+        which = "nothing" if id is None else f"no message {id}"
+        raise SpecError(path, f"{which} of it is in quarantine: `holdfast quarantine` lists what is")
+    return meant
+
+
+def _settle(remote: RemoteSystem, verb: Literal["retry", "drop"], meant: list[PutAside], as_json: bool) -> None:
+    """Have it done for these messages and no others, and show for which it was done."""
+    done, failed = list[PutAside](), list[str]()
+    for one in meant:
+        try:
+            settled, not_settled = remote.settle_put_aside(verb, one.address, one.id)
+        except SpecError as error:  # Somebody else has settled it meanwhile.
+            settled, not_settled = [], [str(error)]
+        done += settled
+        failed += not_settled
     if as_json:
         told: Any = {"done": msgspec.to_builtins(done), "failed": failed}
         show_json(told)

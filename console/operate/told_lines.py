@@ -30,6 +30,8 @@ def life_line(life: PastLife) -> str:
 
     >>> life_line(PastLife(2, started=None, ended=0.0, reason="no such file")).partition(": ")[2]
     'not started, no such file'
+    >>> life_line(PastLife(2, ended=0.0, started=0.0, reason="killed", by="the program")).rpartition(", ")[2]
+    'by the program'
     """
     began = "not started" if life.started is None else moment(life.started)
     parts = [f"life {life.number}: {began}"]
@@ -40,7 +42,7 @@ def life_line(life: PastLife) -> str:
             parts.append(f"ended {moment(life.ended)}")
         parts.append(life.reason)
         parts += [f"handling {life.handling}"] if life.handling else []
-        parts += [f"by {life.by} ({life.because})"] if life.by else []
+        parts += [f"by {life.author}"] if life.by else []
         parts += [f"restart {life.restarts} of {life.allowed}"] if life.restarts is not None else []
     parts += [f"{life.turns} turns"] if life.turns is not None else []
     parts += [f"the longest {life.longest_turn:.1f} s with {life.longest_message}"] if life.longest_message else []

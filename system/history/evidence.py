@@ -548,7 +548,7 @@ def _queued(cell: Cell, most: int) -> Iterator[_Queued]:
             seconds = _waited(item, node.loop.time())
             yield _Queued(message_type(message_in(item)), sender, seconds, is_late, isinstance(item, Ask))
         return
-    in_hand = cell.host.place.running(cell)
+    in_hand = switch.in_hand(cell.host.place.running(cell))
     for source in islice(switch.ledger.open.values(), most):
         if source.kind == MESSAGE and source.id != in_hand and not source.was_stashed:
             seconds = max(0.0, node.clock.wall() - source.time)

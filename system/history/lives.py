@@ -67,6 +67,11 @@ class PastLife(msgspec.Struct):
         """Say whether the life has ended, or did not even begin."""
         return self.ended is not None
 
+    @property
+    def author(self) -> str:
+        """Who has ended it, and why in brackets, as far as that is known."""
+        return f"{self.by} ({self.because})" if self.because else self.by
+
 
 CLEAN = frozenset({"", "Normal", "Shutdown", "SystemStopped", "RootKilled", "FailedOver"})
 """The kinds of ends that are no fault of whoever has ended."""
@@ -306,7 +311,7 @@ def _root_ended(lives: Lives, event: PastEvent) -> None:
         life = lives[-1]
         life.ended, life.reason = event.at, _text(event, "why") or "the system stopped"
         life.reason_kind = "SystemStopped" if event.kind == "SystemStopped" else "RootKilled"
-        life.by = "the program"
+        life.by = "the program" if event.kind == "SystemStopped" else ""
 
 
 WITH_THE_ROOT = frozenset({"SystemStopped", "RootKilled"})

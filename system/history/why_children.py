@@ -148,7 +148,7 @@ def ended_children(evidence: Evidence) -> list[str]:
         if life.reason_kind == "StartFailed":
             said.append(f"Its child {_name(path)} could not be started {ago}: {brief(life.reason)}.")
         else:
-            by = f", by {life.by} ({life.because})" if life.by else ""
+            by = f", by {life.author}" if life.by else ""
             said.append(f"Its child {_name(path)} ended {ago} and is not there: {brief(life.reason)}{by}.")
     more = len(ended) - MOST_NAMED
     return [*said, f"{more} more of its children are not there."] if more > 0 else said

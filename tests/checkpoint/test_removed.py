@@ -392,6 +392,27 @@ CHECKS = {
         ORDER,
         "had_timed_out_starts_again",
     ),
+    "the next program knows since when a turn waits": Check(
+        "checkpoint/long_waits.py",
+        "begun = clock.wall() if due is None else due - span_of(out)",
+        "begun = clock.wall()",
+        "tests/effects/test_since_when.py",
+        "next_program_tells",
+    ),
+    "what rests in a process is in hand": Check(
+        "checkpoint/home/switch.py",
+        "return self.ledger.begun if running < 0 and self.calls.rests.is_busy else running",
+        "return running",
+        "tests/effects/test_since_when.py",
+        "rests_in_a_process",
+    ),
+    "a stop leaves a turn that waits for who is suspended": Check(
+        "checkpoint/home/pending_asks.py",
+        "cell.more.suspended & BY_USER",
+        "cell.more.suspended & 0",
+        "tests/effects/test_asks_of_suspended.py",
+        "test_a_stop_leaves",
+    ),
     "a wait of so many seconds goes by a clock that nobody sets": Check(
         "checkpoint/long_waits.py",
         "left = when - (clock.wall() if is_moment else clock.passed())",

@@ -77,7 +77,7 @@ CHECKS = {
     ),
     "a recorded actor has in hand what its home says": Check(
         "checkpoint/home/journal_home.py",
-        "        return Work(mark, source is not None, None if turn is None else turn.since, has_answered)\n",
+        "        return Work(mark, source is not None, since, has_answered, begun=begun)\n",
         "        return Work(cell.item)\n",
         KINDS,
         "seen_to_work_and_to_hang and process-hybrid",

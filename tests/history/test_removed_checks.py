@@ -298,7 +298,7 @@ CHECKS = {
     ),
     "an effect that is out is known to the home": Check(
         "checkpoint/home/pending_asks.py",
-        'self.effects[place] = TurnRest("effect", out.to, self._home.node.clock.wall())',
+        'self.effects[place] = TurnRest("effect", out.to, self._home.node.clock.wall(), is_again=is_again)',
         "pass",
         LIVE,
         "rests_as_it_has_said and hybrid",

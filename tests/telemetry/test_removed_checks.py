@@ -33,6 +33,20 @@ CHECKS = {
         TRACES,
         "test_a_replay_makes_no_spans_of_old_work",
     ),
+    "an ask of a recorded turn has a span": Check(
+        "checkpoint/home/outputs.py",
+        "        if out.trace:\n            tail, hears",
+        "        if False:\n            tail, hears",
+        TRACES,
+        "test_what_a_recorded_turn_asks_is_below_it",
+    ),
+    "the span of an ask of a recorded turn hears its outcome": Check(
+        "checkpoint/home/pending_asks.py",
+        "ask.hears(ask.failure(answer))",
+        "ask.hears(None)",
+        TRACES,
+        "test_an_ask_of_a_recorded_turn_that_fails",
+    ),
     "the span in which a system was entered is that of no turn": Check(
         "actors/control/spans.py",
         "if (ctx is None or here is not self._base) and self._decides(here):",
@@ -133,7 +147,7 @@ CHECKS = {
     ),
     "what a recorded turn asks is below it": Check(
         "checkpoint/home/outputs.py",
-        "            chain = with_tail(chain, out.trace)",
+        "            chain = with_tail(chain, tail)",
         "            pass",
         TRACES,
         "test_what_a_recorded_turn_asks_is_below_it",

@@ -28,6 +28,7 @@ from holdfast.testing import GuardedSystem, Simulation, simulate
 from tests.telemetry.scrapes import until
 from tests.telemetry.traced_shop import (
     Again,
+    Blame,
     Clerk,
     Count,
     Fail,
@@ -487,12 +488,32 @@ async def test_what_a_recorded_turn_asks_is_below_it(traced: Traced, receiver: s
         system.trace_with(traced.tracer, one_in=math.inf)
         with traced.tracer.start_as_current_span("request"):
             told = await alice.ask(Onward())
-        onward = traced.one("handle Onward")
+        onward, ask = traced.one("handle Onward"), traced.one("ask Where")
         assert told.split()[0] == f"{trace_of(onward):032x}"
-        if receiver == "process":  # It makes no spans: the span that is current there is that of the turn.
-            assert told.split()[1] == f"{id_of(onward):016x}"
+        assert parent_of(ask) == id_of(onward)
+        assert (ask.kind, dict(ask.attributes or {})) == (SpanKind.CLIENT, {"holdfast.address": "/app/bob"})
+        if receiver == "process":  # It makes no spans: the span that is current there is that of the ask.
+            assert told.split()[1] == f"{id_of(ask):016x}"
         else:
-            assert parent_of(traced.one("handle Where")) == id_of(onward)
+            assert parent_of(traced.one("handle Where")) == id_of(ask)
+
+
+async def test_an_ask_of_a_recorded_turn_that_fails_says_so_in_its_only_span(traced: Traced) -> None:
+    async with hf.ActorSystem("app", log=False, intensity=9) as system:
+        await system.start(hf.child("bob", hf.start(Clerk)))
+        spec = hf.child("alice", hf.start(Clerk), bindings=NEXT, recovery=hf.replay_only())
+        alice = await system.start(spec)
+        system.trace_with(traced.tracer, one_in=math.inf)
+        with traced.tracer.start_as_current_span("request"):
+            await alice.ask(Blame())
+        with system.events() as stream:
+            alice.kill()
+            await until(stream, hf.events.Recovered)
+    failed = traced.one("ask Fail")
+    assert (failed.status.status_code, dict(failed.attributes or {})["error.type"]) == (
+        StatusCode.ERROR,
+        "holdfast.actors.errors.RemoteCrash",
+    )
 
 
 async def test_what_a_recorded_turn_forwards_is_below_it(traced: Traced) -> None:

@@ -1,6 +1,7 @@
 """Actors that say which span they are in, and, in a process of their own, which spans were made there."""
 
 import asyncio
+import contextlib
 from collections.abc import Iterable
 from typing import Any
 
@@ -40,6 +41,10 @@ class Fail(hf.Message[str]): ...
 
 class Onward(hf.Message[str]):
     """Asks the next one where it is."""
+
+
+class Blame(hf.Message[None]):
+    """Has the next one fail."""
 
 
 class Onto(hf.Message[None]):
@@ -137,6 +142,11 @@ class Clerk(hf.Actor):
     @hf.on(Onward)
     async def onward(self, message: Onward) -> str:
         return await self.next_one.ask(Where())
+
+    @hf.on(Blame)
+    async def blame(self, message: Blame) -> None:
+        with contextlib.suppress(hf.errors.RemoteCrash):
+            await self.next_one.ask(Fail())
 
     @hf.on(Onto)
     def onto(self, message: Onto) -> None:
