@@ -23,6 +23,7 @@ from ..errors import (
     StartFailed,
     UnknownMessage,
     WrongActor,
+    shown,
     type_name,
 )
 from ..events import DeadLetter, Event, EventHub, SupervisorGaveUp
@@ -30,6 +31,7 @@ from ..exit_reasons import ExitReason
 from ..persistence import Keeper, NothingKept
 from ..values.path_parts import check_beside, check_path_part
 from . import lifecycle
+from .actor import Actor, Start
 from .blocking_handlers import HandlerThreads
 from .cell import DOWN, GONE, RUNNING, Cell, CellKinds, GivenName, Host, Scope
 from .codec import Codec
@@ -39,12 +41,10 @@ from .lifecycle import LOCAL
 from .links import MADE_UP_NAME
 from .loop import RunLoop
 from .mailbox import Bound, Bounded, admit_bounded, admit_gone
-from .message import Refusal
 from .topics import Topics
 
 if TYPE_CHECKING:
     from ..deadline_thread import Overdue
-    from .actor import Actor, Start
     from .address_host import AddressHost
     from .ref import ActorRef, Target
 
@@ -102,13 +102,15 @@ class Supervised:
 
     Attributes:
         gave_up: the last one here that did.
+        crashed: the last one here that did because of a crash: those above it give up because it has ended.
         waiting: those with children that have waited for somebody to whom they are bound; perhaps none waits any more.
     """
 
-    __slots__ = ("gave_up", "waiting")
+    __slots__ = ("crashed", "gave_up", "waiting")
 
     def __init__(self) -> None:
         self.gave_up: SupervisorGaveUp | None = None
+        self.crashed: SupervisorGaveUp | None = None
         self.waiting = weakref.WeakSet[Cell]()
 
 
@@ -282,8 +284,8 @@ class Node(RunLoop):
         if not isinstance(error, (ActorStopped, UnknownMessage)):
             self.dead_letter(cell, message, str(error), sender)
 
-    def refused(self, cell: Cell, item: Any, no: Refusal) -> None:
-        """A tell was answered with a Refusal: there is nobody to hand it to."""
+    def refused(self, cell: Cell, item: Any, no: HoldfastError) -> None:
+        """A tell was answered with a Refusal, or was no valid order: there is nobody to hand that to."""
         if self.events.hears_letters:
             known = item.sender.path if isinstance(item, Item) and item.sender is not None else ""
             self.events.emit(DeadLetter(cell.path, item, f"refused: {no}", known))
@@ -321,6 +323,8 @@ class Node(RunLoop):
         self, start: Start[Any], name: str | None = None, *, parent: Cell | None = None, mailbox: Bounded | None = None
     ) -> Cell:
         """Start an actor in this process that nobody restarts. It is up when this returns, but for its `on_start`."""
+        if not isinstance(start, Start):
+            raise SpecError("spawn", f"takes start(Class, ...), not {shown(start)}")
         cell = self.cell_below(parent if parent is not None else self.root, name)
         if mailbox is not None:
             self.bound(cell, mailbox)
@@ -387,6 +391,8 @@ class Node(RunLoop):
         """
         from .ref import ActorRef
 
+        if not isinstance(path, str) or not isinstance(kind, type) or not issubclass(kind, Actor):
+            raise SpecError("find", f"takes an address and the class of an actor, not {shown(path)} and {shown(kind)}")
         cell = self.find(path)
         if cell is None or cell.is_dead:
             raise NoSuchActor(path)
@@ -402,7 +408,7 @@ class Node(RunLoop):
         if isinstance(target, ActorRef):
             return target._cell.living
         if not isinstance(target, str):
-            raise SpecError(repr(target), "is neither a ref nor an address")
+            raise SpecError(shown(target), "is neither a ref nor an address")
         cell = self.find(target)
         if cell is None or cell.is_dead:
             raise NoSuchActor(target)

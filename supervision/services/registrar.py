@@ -23,7 +23,7 @@ from ...actors.kernel.actor import Actor, on
 from ...actors.kernel.cell import DOWN, GONE, Cell
 from ...actors.kernel.envelope import Ask, ReplyHandle
 from ...actors.kernel.links import Monitor
-from ...actors.kernel.message import Message, Refusal
+from ...actors.kernel.message import Message, Refusal, RuntimeCall
 from ...actors.kernel.ref import ActorRef
 from ...actors.persistence import ENTRIES, entries_key
 from ...actors.process.wire.peer import OutsideHost
@@ -59,7 +59,7 @@ class RegistryRow(msgspec.Struct, frozen=True, array_like=True):
     value: Any
 
 
-class Register(Message[None]):
+class Register(RuntimeCall[None]):
     """Hold a key. `life` is the sender's, 0 if it is recorded (its replay must send the same)."""
 
     key: bytes
@@ -67,7 +67,7 @@ class Register(Message[None]):
     life: int
 
 
-class Find(Message[list[RegistryRow]]):
+class Find(RuntimeCall[list[RegistryRow]]):
     """The entries of a key, of a holder, of both, or all."""
 
     key: bytes | None = None
@@ -78,14 +78,14 @@ class Count(Message[int]):
     """How many entries there are."""
 
 
-class DropEntries(Message[int]):
+class DropEntries(RuntimeCall[int]):
     """Give up the sender's entries for a key: those numbered, or all. The reply is how many these were."""
 
     key: bytes
     numbers: list[int] | None = None
 
 
-class ReplaceValue(Message[bool]):
+class ReplaceValue(RuntimeCall[bool]):
     """Put another value into an entry of the sender's; False if it is gone."""
 
     key: bytes
@@ -93,7 +93,7 @@ class ReplaceValue(Message[bool]):
     value: Any
 
 
-class Lock(Message[None]):
+class Lock(RuntimeCall[None]):
     """Have a key's lock; the reply is that it is had."""
 
     key: bytes
@@ -101,27 +101,27 @@ class Lock(Message[None]):
     life: int
 
 
-class Unlock(Message[None]):
+class Unlock(RuntimeCall[None]):
     """Give a lock back, or up."""
 
     key: bytes
     ticket: str
 
 
-class PutMeta(Message[None]):
+class PutMeta(RuntimeCall[None]):
     """Keep a value that belongs to the registry itself."""
 
     name: str
     value: Any
 
 
-class GetMeta(Message[list[Any]]):
+class GetMeta(RuntimeCall[list[Any]]):
     """Such a value: a list of one, or an empty one."""
 
     name: str
 
 
-class DeleteMeta(Message[None]):
+class DeleteMeta(RuntimeCall[None]):
     """Forgets a value that belongs to the registry as a whole."""
 
     name: str
