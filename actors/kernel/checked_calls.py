@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from ..errors import BadMessage, HoldfastError, SpecError, shown, type_name
-from .codec import misfit
+from .codec import decode_error, misfit
 from .envelope import AskHandle
 from .message import Refusal
 
@@ -43,16 +43,16 @@ def misfit_of(message: RuntimeCall[Any]) -> str:
     """
     kind = type(message)
     values = msgspec.structs.astuple(message)
-    try:
-        msgspec.convert(values, kind, builtin_types=(bytes,))
-    except msgspec.ValidationError as error:
-        return misfit(kind, error)
     for name, value in zip(kind.__struct_fields__, values, strict=True):
         if isinstance(value, str) and not value.isascii():
             try:
                 value.encode()
             except UnicodeEncodeError:
                 return f"Expected text that can be written, got {shown(value)} - at `{name}`"
+    try:
+        msgspec.convert(values, kind, builtin_types=(bytes,))
+    except Exception as error:  # What a field holds may raise what it likes while it is looked at.
+        return misfit(kind, decode_error(error))
     return ""
 
 

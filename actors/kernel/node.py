@@ -97,6 +97,12 @@ class Ports:
     """Runs a function with its arguments in a process of its own."""
 
 
+def check_sought(path: object, kind: object) -> None:
+    """Whether this is an address, and the class of who is to live there. Raises SpecError."""
+    if not isinstance(path, str) or not isinstance(kind, type) or not issubclass(kind, Actor):
+        raise SpecError("find", f"takes an address and the class of an actor, not {shown(path)} and {shown(kind)}")
+
+
 class Supervised:
     """What the supervisors of a node have said of themselves.
 
@@ -391,8 +397,7 @@ class Node(RunLoop):
         """
         from .ref import ActorRef
 
-        if not isinstance(path, str) or not isinstance(kind, type) or not issubclass(kind, Actor):
-            raise SpecError("find", f"takes an address and the class of an actor, not {shown(path)} and {shown(kind)}")
+        check_sought(path, kind)
         cell = self.find(path)
         if cell is None or cell.is_dead:
             raise NoSuchActor(path)

@@ -31,6 +31,7 @@ from ...actors.kernel.context import NO_MESSAGE, ActorContext, StashError
 from ...actors.kernel.envelope import Ask, Item, ReplyHandle, require_error
 from ...actors.kernel.links import Monitor
 from ...actors.kernel.message import Message, message_name, require_message
+from ...actors.kernel.node import check_sought
 from ...actors.kernel.ref import ActorRef, cell_of, current
 from ...actors.kernel.timers import Timer
 from ...actors.seconds import check_seconds
@@ -277,6 +278,7 @@ class RecordedContext(ActorContext):
         """A ref to the address, whoever lives there: under replay somebody else, or nobody yet (T21)."""
         if not self._in_turn() and not self.recorded.hook:
             return super().find(path, kind)
+        check_sought(path, kind)
         node = self._cell.node
         cell = node.cell_at(path)
         return ActorRef(cell) if cell.is_dead else node.find_ref(path, kind)

@@ -16,11 +16,12 @@ from typing import Any, Literal
 
 import msgspec
 
-from ...actors.errors import ActorStopped, HoldfastError
+from ...actors.errors import ActorStopped, BadMessage, HoldfastError
 from ...actors.events import StoreRefused
 from ...actors.exit_reasons import ExitReason
 from ...actors.kernel.actor import Actor, on
 from ...actors.kernel.cell import DOWN, GONE, Cell
+from ...actors.kernel.checked_calls import refuse
 from ...actors.kernel.envelope import Ask, ReplyHandle
 from ...actors.kernel.links import Monitor
 from ...actors.kernel.message import Message, Refusal, RuntimeCall
@@ -242,22 +243,27 @@ class RegistryActor(Actor):
     # -- who holds what ---------------------------------------------------------------------------------------------
 
     @on(Register)
-    def _register(self, message: Register) -> None:
+    def _register(self, message: Register) -> ReplyHandle[Any] | None:
         """A unique key has one living holder; a recorded one has one entry for a key, and may say it again."""
         holder = self._sender()
         if not is_living(holder, message.life):
-            return  # Its ask has outlived it.
+            return None  # Its ask has outlived it.
+        try:
+            key_of(message.key)
+        except msgspec.DecodeError as error:
+            return refuse(self.ctx, BadMessage(self.ctx.path, "Register", f"Expected a packed key - at `key`: {error}"))
         holdings = self._book.holders.get(holder)
         for entry in () if holdings is None else holdings.entries:
             if entry.key == message.key and 0 in (entry.life, message.life):
                 entry.life, entry.value = message.life, message.value
                 self._note(holder)
-                return
+                return None
         if (other := self._in_the_way(message.key)) is not None:
             raise KeyTaken(other.holder.ref)
         self._enter(message.key, holder, message.life, message.value)
         if message.life == 0:
             self._note(holder)
+        return None
 
     def _in_the_way(self, key: bytes) -> HeldKey | None:
         """The entry of a living actor that has this key, if only one may have it."""
