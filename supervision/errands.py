@@ -14,9 +14,8 @@ from typing import Any
 
 from ..actors.errors import HoldfastError
 from ..actors.kernel import lifecycle, mailbox
-from ..actors.kernel.checked_calls import fail
 from ..actors.kernel.context import ActorContext
-from ..actors.kernel.envelope import LEAVE, Ask, Envelope, Item, ReplyHandle
+from ..actors.kernel.envelope import LEAVE, Ask, Envelope, Item, ReplyHandle, fail
 from .admin import StartChild
 
 

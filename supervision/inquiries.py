@@ -8,8 +8,7 @@ from typing import Any
 
 from ..actors.errors import HoldfastError
 from ..actors.kernel.actor import Actor, on
-from ..actors.kernel.checked_calls import refuse
-from ..actors.kernel.envelope import ReplyHandle
+from ..actors.kernel.envelope import ReplyHandle, refuse
 from .admin import (
     Boxed,
     ChildCounts,

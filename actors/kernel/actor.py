@@ -16,7 +16,7 @@ from ..seconds import is_seconds
 from ..values.path_parts import check_topic
 from .bindings import Binding, noting
 from .blocking_handlers import in_thread
-from .checked_calls import checking
+from .codec import checking
 from .envelope import Table
 from .message import Message, RuntimeCall, RuntimeOrder
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
 import msgspec
 
-from ..errors import AskTimeout, HoldfastError, SpecError, UnknownMessage, shown, type_name
+from ..errors import AskTimeout, BadMessage, HoldfastError, SpecError, UnknownMessage, shown, type_name
 from .message import Message, MessageText, Refusal, by_name, message_of
 
 if TYPE_CHECKING:
@@ -365,3 +365,17 @@ class AskHandle(ReplyHandle[R]):
         require_error(error)
         if self._ask is not None:
             self._ask.fail(error)
+
+
+def refuse(ctx: ActorContext, error: HoldfastError) -> ReplyHandle[Any]:
+    """Answer the call in hand with an error; if nobody has asked, that is logged. The actor goes on."""
+    handle: ReplyHandle[Any] = ctx.reply_handle()
+    fail(ctx, handle, ctx._item, error)
+    return handle
+
+
+def fail(ctx: ActorContext, handle: ReplyHandle[Any], item: object, error: HoldfastError) -> None:
+    """Answer by an error through a handle for `item`; if nobody has asked, and it is the call that is wrong, log it."""
+    handle.fail(error)
+    if isinstance(handle, AskHandle) and handle.ask is None and isinstance(error, (Refusal, BadMessage, SpecError)):
+        ctx._cell.node.refused(ctx._cell, item, error)

@@ -175,7 +175,8 @@ class PoolSupervisor(UniformSupervisor):
 
     async def _resized(self, message: ResizePool) -> int:
         if not 0 <= message.size <= MOST_WORKERS or not message.deadline >= 0:
-            raise SpecError("ResizePool", f"size must be from 0 to {MOST_WORKERS}, and deadline >= 0, not {message!r}")
+            problem = f"size and deadline must be >= 0, and size at most {MOST_WORKERS}, not {message!r}"
+            raise SpecError("ResizePool", problem)
         async with self._growing:  # One after another; who goes is not waited for by who comes.
             before = len(self._crew)
             going = self._crew[message.size :]

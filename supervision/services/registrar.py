@@ -21,8 +21,7 @@ from ...actors.events import StoreRefused
 from ...actors.exit_reasons import ExitReason
 from ...actors.kernel.actor import Actor, on
 from ...actors.kernel.cell import DOWN, GONE, Cell
-from ...actors.kernel.checked_calls import refuse
-from ...actors.kernel.envelope import Ask, ReplyHandle
+from ...actors.kernel.envelope import Ask, ReplyHandle, refuse
 from ...actors.kernel.links import Monitor
 from ...actors.kernel.message import Message, Refusal, RuntimeCall
 from ...actors.kernel.ref import ActorRef

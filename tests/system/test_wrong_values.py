@@ -82,7 +82,7 @@ async def test_a_recorded_end_that_nobody_can_read_is_a_crash(monkeypatch: Any) 
         with system.events() as events:
             one.kill()  # In the middle of its end: the next life has to do what the record says.
             await asyncio.sleep(20.0)
-            crashes = [event.reason.text for event in events.take() if isinstance(event, hf.events.ActorCrashed)]
+            crashes = [str(event.reason) for event in events.take() if isinstance(event, hf.events.ActorCrashed)]
         assert len(crashes) == 1
         assert "an exit reason, {'exit': 'str'}" in crashes[0]
         assert await system.get_state(one) == {"done": 0}
@@ -170,6 +170,13 @@ async def test_a_wrong_call_that_nobody_waits_for_is_logged() -> None:
         assert ["refused" in why for why in told] == [True] * 4, told
 
 
+async def test_a_pool_has_a_limit() -> None:
+    async with hf.ActorSystem(log=False) as system:
+        crew = await system.start(hf.supervision.pool("crew", hf.start(Idle), 1))
+        with pytest.raises(hf.SpecError, match="size at most 100000"):
+            await crew.ask(hf.supervision.ResizePool(2**40), 1.0)
+
+
 # -- what takes a ref, an address, a topic, a spec or an error -------------------------------------------------------
 
 NO_REFS: tuple[Any, ...] = ("/app/b", "b", None, 7, Idle)
@@ -194,6 +201,12 @@ IN_A_TURN: dict[str, tuple[Callable[[hf.ActorContext, Any], Any], tuple[Any, ...
     "fail": (lambda ctx, value: ctx.reply_handle().fail(value), NO_ERRORS, "takes a Refusal or another HoldfastError"),
 }
 
+
+def on_target(verb: str) -> Callable[[hf.ActorSystem, Any], Any]:
+    """The method of the system with this name, of which the value says who is meant."""
+    return lambda system, value: operator.methodcaller(verb, value)(system)
+
+
 FROM_OUTSIDE: dict[str, tuple[Callable[[hf.ActorSystem, Any], Any], tuple[Any, ...], str]] = {
     "spawn": (lambda system, value: system.spawn(value), NO_STARTS, r"takes start\(Class"),
     "start": (lambda system, value: system.start(value), NO_STARTS, r"takes child\("),
@@ -204,7 +217,7 @@ FROM_OUTSIDE: dict[str, tuple[Callable[[hf.ActorSystem, Any], Any], tuple[Any, .
     "unregister": (lambda system, value: system.unregister(value), NO_NAMES, "a name must be text"),
     "whereis": (lambda system, value: system.whereis(value), NO_NAMES, "a name must be text"),
     **{
-        verb: (operator.methodcaller, (None, 7, ["/x"], Idle), "is neither a ref nor an address")
+        verb: (on_target(verb), (None, 7, ["/x"], Idle), "is neither a ref nor an address")
         for verb in ("stop", "terminate", "suspend", "resume", "get_state", "get_status", "checkpoint", "pid_of")
     },
     "id": (lambda system, value: idle(value), (*NO_NAMES[:1], *NO_NAMES[2:], "a/b"), "the id must be text"),
@@ -244,13 +257,13 @@ async def test_a_verb_of_an_actor_says_what_it_takes(recovery: Any) -> None:
 
 async def test_a_verb_of_the_system_says_what_it_takes() -> None:
     async with hf.ActorSystem(log=False) as system:
-        for verb, (call, values, says) in FROM_OUTSIDE.items():
+        for call, values, says in FROM_OUTSIDE.values():
             for value in values:
                 with pytest.raises(hf.SpecError, match=says):
-                    await called(verb, call, system, value)
+                    await called(call, system, value)
 
 
-async def called(verb: str, call: Callable[..., Any], system: hf.ActorSystem, value: Any) -> None:
-    result = call(verb, value)(system) if call is operator.methodcaller else call(system, value)
+async def called(call: Callable[..., Any], system: hf.ActorSystem, value: Any) -> None:
+    result = call(system, value)
     if inspect.isawaitable(result):
         await result
