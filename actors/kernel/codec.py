@@ -398,8 +398,8 @@ def misfit_of(message: RuntimeCall[Any]) -> str:
 
     >>> class Pick(RuntimeCall[None]):
     ...     id: str
-    >>> misfit_of(Pick("a")), misfit_of(Pick(["a"])), misfit_of(Pick("half a pair: \ud800"))
-    ('', 'Expected `str`, got `array` - at `id`', "Expected text that can be written, got 'half a pair: ?' - at `id`")
+    >>> misfit_of(Pick("a")), misfit_of(Pick(["a"])), misfit_of(Pick("half: \ud800"))
+    ('', 'Expected `str`, got `array` - at `id`', "Expected text that can be written, got 'half: \\ud800' - at `id`")
     """
     kind = type(message)
     values = msgspec.structs.astuple(message)

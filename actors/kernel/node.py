@@ -487,9 +487,10 @@ class Node(RunLoop):
             SpecError: the class has no such binding.
         """
         kind = cell_kind(cell)
-        if kind is not None and port not in kind._bindings:
+        if not isinstance(port, str) or (kind is not None and port not in kind._bindings):
+            kind = Actor if kind is None else kind
             known = ", ".join(sorted(kind._bindings)) or "none"
-            raise SpecError(cell.path, f"{type_name(kind)} has no binding {port!r} (it has: {known})")
+            raise SpecError(cell.path, f"{type_name(kind)} has no binding {shown(port)} (it has: {known})")
         more = cell.extra()
         more.claimed = more.claimed | {port} if is_claimed else more.claimed - {port}
         if more.turn is None:

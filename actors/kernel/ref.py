@@ -195,8 +195,9 @@ def cell_of(where: str, ref: object) -> Cell:
     if isinstance(ref, ActorRef):
         cell: Cell = ref._cell
         return cell
-    hint = f"{shown(ref)}, Class" if isinstance(ref, str) and ref.startswith("/") else "'/ADDRESS', Class"
-    raise SpecError(where, f"takes a ref, not {shown(ref)}: ctx.find({hint}) makes one of an address")
+    hint = shown(ref) if isinstance(ref, str) and ref.startswith("/") else "'/ADDRESS'"
+    find = f"ctx.find({hint}, Class), or system.ref({hint}, Class), makes one of an address"
+    raise SpecError(where, f"takes a ref, not {shown(ref)}: {find}")
 
 
 def _restarting(cell: Cell, restarting: str, sender: ActorContext | None) -> asyncio.Future[Any] | None:

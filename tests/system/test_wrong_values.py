@@ -221,6 +221,12 @@ FROM_OUTSIDE: dict[str, tuple[Callable[[hf.ActorSystem, Any], Any], tuple[Any, .
         for verb in ("stop", "terminate", "suspend", "resume", "get_state", "get_status", "checkpoint", "pid_of")
     },
     "id": (lambda system, value: idle(value), (*NO_NAMES[:1], *NO_NAMES[2:], "a/b"), "the id must be text"),
+    "bind": (lambda system, value: system.bind("/app", value, "/app"), (None, 7, ["x"]), "has no binding"),
+    "registry": (lambda system, value: hf.supervision.Registry(value), NO_REFS, "Registry: takes a ref"),
+    "tasks": (lambda system, value: hf.supervision.Tasks(value), NO_REFS, "Tasks: takes a ref"),
+    "tell": (lambda system, value: system.from_thread().tell(value, Stop(0)), NO_REFS, "tell: takes a ref"),
+    "ask": (lambda system, value: system.from_thread().ask(value, Stop(0)), NO_REFS, "ask: takes a ref"),
+    "send": (lambda system, value: system.from_thread().send(value, Stop(0)), NO_REFS, "takes a ref"),
     "decorated": (lambda system, value: hf.subscribe(value), NO_TOPICS, "must start with '/'"),
 }
 
