@@ -267,23 +267,24 @@ def check_reason(where: str, reason: object) -> ExitReason:
     """
     try:
         body = msgspec.msgpack.encode(pack_exit(reason))  # type: ignore[arg-type]  # that is the question
-        kind = type(unpack_exit(msgspec.msgpack.decode(body)))
-    except Exception as error:  # Whatever a field holds that is none of ours may raise what it likes.
-        raise SpecError(where, f"takes an exit reason, not {shown(reason)}: {_hint(reason)}") from error
-    if kind is not type(reason) or len(body) > LONGEST_REASON:
+        read = unpack_exit(msgspec.msgpack.decode(body))
+    except Exception:  # Whatever a field holds that is none of ours may raise what it likes.
+        body, read = b"", None
+    if not isinstance(reason, ExitReason) or type(read) is not type(reason) or len(body) > LONGEST_REASON:
         raise SpecError(where, f"takes an exit reason, not {shown(reason)}: {_hint(reason)}")
-    assert isinstance(reason, ExitReason)
     return reason
 
 
 def _hint(reason: object) -> str:
     match reason:
+        case ExitReason() if type(reason).__module__ != __name__:
+            return "nobody else can read a class of your own; say what you have to say in hf.Shutdown('TEXT')"
         case Shutdown():
-            return "the detail of hf.Shutdown is text that can be written"
+            return f"the detail of hf.Shutdown is text that can be written, in {LONGEST_REASON} bytes at most"
         case Crash():
             return "the fields of hf.Crash are text, and its error is an exception; raise the error itself instead"
         case ExitReason():
-            return "it is not one of the library's own; say what you have to say in hf.Shutdown('TEXT')"
+            return "its fields do not have the types that its class says"
         case type() if issubclass(reason, ExitReason):
             return f"this is the class; give an instance, hf.{reason.__name__}(...)"
         case BaseException():
