@@ -43,6 +43,7 @@ Arguments equal fields in each class, so the codec can rebuild an error in anoth
 from __future__ import annotations
 
 import inspect
+import reprlib
 import string
 from collections.abc import Iterator
 from copy import copy
@@ -567,6 +568,18 @@ def error_text(error: BaseException) -> str:
         return portable(str(error))
     except BaseException as broken:
         return f"<its text cannot be shown: {type_name(type(broken))}>"
+
+
+def shown(value: object) -> str:
+    """A value that somebody gave, for the error that refuses it: short, and whatever its `__repr__` does.
+
+    >>> shown("alice"), shown(list("abcdefghi")), shown("half a pair: \\ud800")
+    ("'alice'", "['a', 'b', 'c', 'd', 'e', 'f', ...]", "'half a pair: \\\\ud800'")
+    """
+    try:
+        return portable(reprlib.repr(value))
+    except BaseException as broken:
+        return f"<a {type_name(type(value))} that cannot be shown: {type_name(type(broken))}>"
 
 
 def portable(text: str) -> str:

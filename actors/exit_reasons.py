@@ -10,9 +10,11 @@ import signal
 
 import msgspec
 
-from .errors import StartFailed, error_text, format_error, type_name
+from .errors import DamagedValue, RemoteCrash, SpecError, StartFailed, error_text, format_error, shown, type_name
 
 START_FAILED = type_name(StartFailed)
+LONGEST_REASON = 1024 * 1024
+"""Bytes that an exit reason of a user's may take: more than what is kept of the text and traceback of an error."""
 
 
 class ExitReason(msgspec.Struct, frozen=True):
@@ -197,12 +199,23 @@ def crash(error: BaseException) -> ExitReason:
     return Crash(type_name(type(error)), error_text(error), "", error)
 
 
+def raised_in(reason: ExitReason) -> BaseException | None:
+    """What was raised in a life that has ended so, as a RemoteCrash from another process; None if nothing was."""
+    if not isinstance(reason, Crash):
+        return None
+    return reason.error if reason.error is not None else RemoteCrash(reason.type_name, reason.text, reason.formatted)
+
+
 def start_failed(actor: str, reason: ExitReason) -> StartFailed:
     """The error of a start that ended for `reason`; its cause is what was raised, if that was in this process."""
     failed = StartFailed(actor, str(reason))
     failed.__cause__ = reason.error if isinstance(reason, Crash) else None
     failed.struck_by = reason.common_cause
     return failed
+
+
+UNREAD = "the reason is told as a crash instead, and whoever hears of it decides what follows"
+"""What becomes of a recorded exit reason that cannot be read."""
 
 
 class _Wire(msgspec.Struct, frozen=True):
@@ -242,6 +255,46 @@ def pack_exit(reason: ExitReason) -> dict[str, object]:
             return {"exit": type(reason).__name__}
 
 
+def check_reason(where: str, reason: object) -> ExitReason:
+    """Return `reason`, if it is one of the exit reasons here, and can be told elsewhere and read back from a journal.
+
+    Args:
+        where: the call that it was given to.
+        reason: what was given.
+
+    Raises:
+        SpecError: it is none, and what to write instead.
+    """
+    try:
+        body = msgspec.msgpack.encode(pack_exit(reason))  # type: ignore[arg-type]  # that is the question
+        read = unpack_exit(msgspec.msgpack.decode(body))
+    except Exception:  # Whatever a field holds that is none of ours may raise what it likes.
+        body, read = b"", None
+    if not isinstance(reason, ExitReason) or type(read) is not type(reason) or len(body) > LONGEST_REASON:
+        raise SpecError(where, f"takes an exit reason, not {shown(reason)}: {_hint(reason)}")
+    return reason
+
+
+def _hint(reason: object) -> str:
+    match reason:
+        case ExitReason() if type(reason).__module__ != __name__:
+            return "nobody else can read a class of your own; say what you have to say in hf.Shutdown('TEXT')"
+        case Shutdown():
+            return f"the detail of hf.Shutdown is text that can be written, in {LONGEST_REASON} bytes at most"
+        case Crash():
+            return "the fields of hf.Crash are text, and its error is an exception; raise the error itself instead"
+        case ExitReason():
+            return "its fields do not have the types that its class says"
+        case type() if issubclass(reason, ExitReason):
+            return f"this is the class; give an instance, hf.{reason.__name__}(...)"
+        case BaseException():
+            return "raise the exception, or give hf.Shutdown('TEXT')"
+        case str():
+            return f"write hf.Shutdown({shown(reason)}) for an end in good order, or raise an exception for a crash"
+        case _:
+            return "hf.NORMAL, or hf.Shutdown('TEXT'); raise an exception for a crash"
+
+
 def unpack_exit(data: object) -> ExitReason:
     """The exit reason a frame carries.
 
@@ -276,3 +329,15 @@ def unpack_exit(data: object) -> ExitReason:
             return TrustBreach(wire.text)
         case other:
             raise msgspec.ValidationError(f"unknown exit reason {other!r}")
+
+
+def recorded_exit(data: object) -> ExitReason:
+    """The exit reason that a journal has; a crash in its place, if nobody can read it.
+
+    >>> recorded_exit({"exit": "Shutdown", "detail": "at night"}), recorded_exit({"exit": "str"}).is_clean
+    (Shutdown(detail='at night', because_of=''), False)
+    """
+    try:
+        return unpack_exit(data)
+    except msgspec.ValidationError as error:
+        return crash(DamagedValue(f"an exit reason, {shown(data)}: {error}", UNREAD))

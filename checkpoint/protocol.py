@@ -16,7 +16,7 @@ from typing import Annotated, Any, TypeAlias
 import msgspec
 
 from ..actors.effects import FailedAttempt
-from ..actors.exit_reasons import ExitReason, unpack_exit
+from ..actors.exit_reasons import ExitReason, recorded_exit
 from ..actors.kernel.cell import GivenName
 from ..actors.kernel.mailbox import Bounded
 from .method import Method
@@ -152,7 +152,7 @@ class EndWanted(msgspec.Struct, array_like=True, gc=False):
     @property
     def exit_reason(self) -> ExitReason:
         """Why the actor ends, as its supervisor is told."""
-        return unpack_exit(msgspec.msgpack.decode(self.reason))
+        return recorded_exit(msgspec.msgpack.decode(self.reason))
 
 
 # -- home to life ----------------------------------------------------------------------------------------------------

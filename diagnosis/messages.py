@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from ..actors.kernel.message import Message
+from ..actors.kernel.message import Message, RuntimeCall
 from .engine import Diagnosis
 from .literals import Literal
 from .model import Declaration
@@ -47,7 +47,7 @@ class Grace(Message):
     """It was started by others: how often that happens is still counted."""
 
 
-class Touched(Message):
+class Touched(RuntimeCall):
     """A repair action upon these components has ended: among equals they are suspected last for a while (O3).
 
     `grace` asks for so many seconds of grace for them and for what depends on them; 0 after a stop, whose effect is
@@ -60,7 +60,7 @@ class Touched(Message):
     grace: float = 0.0
 
 
-class ComponentsStarted(Message):
+class ComponentsStarted(RuntimeCall):
     """These components have begun a new life: their supervisor, or a person, has started them again.
 
     `seconds`: how long what is seen of them, and of what depends on them, says nothing yet.
@@ -70,14 +70,14 @@ class ComponentsStarted(Message):
     seconds: float
 
 
-class ObserverCrashed(Message):
+class ObserverCrashed(RuntimeCall):
     """An observer has crashed: it may be that nobody sees any more what it was to look at."""
 
     source: str
     why: str
 
 
-class ModelChanged(Message):
+class ModelChanged(RuntimeCall):
     """The model has another version now."""
 
     version: int

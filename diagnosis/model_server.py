@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Final
 
 from ..actors.kernel.actor import Actor, on
-from ..actors.kernel.message import Message, Refusal
+from ..actors.kernel.message import Message, Refusal, RuntimeCall
 from .messages import MODEL, ModelChanged
 from .model import (
     Change,
@@ -37,14 +37,14 @@ class GetVersions(Message[tuple[Version, ...]]):
     """All versions that are kept, oldest first."""
 
 
-class ChangeModel(Message[int]):
+class ChangeModel(RuntimeCall[int]):
     """Make all of the changes, or none; answered with the new version. Refused with `ModelRefused`."""
 
     changes: tuple[Change, ...]
     reason: str = ""
 
 
-class LoadModel(Message[int]):
+class LoadModel(RuntimeCall[int]):
     """Replace the model by that of a file's text (YAML); answered with the new version. Refused with `ModelRefused`."""
 
     text: str
@@ -52,7 +52,7 @@ class LoadModel(Message[int]):
     """How errors name the file."""
 
 
-class RollBackModel(Message[int]):
+class RollBackModel(RuntimeCall[int]):
     """Make an earlier version count again, the one before unless it is named; answered with the new version's number.
 
     Refused with `ModelRefused`: it is not kept.
@@ -62,7 +62,7 @@ class RollBackModel(Message[int]):
     reason: str = ""
 
 
-class ValidateModel(Message[tuple[Finding, ...]]):
+class ValidateModel(RuntimeCall[tuple[Finding, ...]]):
     """Ask what changes of the model would lead to; nothing is changed.
 
     Answered with what lint finds; refused with `ModelRefused`.

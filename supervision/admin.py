@@ -6,9 +6,10 @@ from typing import Any
 
 import msgspec
 
-from ..actors.errors import HoldfastError, SpecError
+from ..actors.errors import HoldfastError, SpecError, shown
+from ..actors.exit_reasons import SHUTDOWN, ExitReason, check_reason, unpack_exit
 from ..actors.kernel.codec import Packable, Packed
-from ..actors.kernel.message import Message, Refusal, RuntimeOrder
+from ..actors.kernel.message import Message, Refusal, RuntimeCall, RuntimeOrder
 from ..actors.kernel.node import Node
 from ..actors.kernel.ref import ActorRef
 from ..actors.process.wire.start_codec import pack_data, unpack_data
@@ -210,6 +211,17 @@ class RemoveChild(RuntimeOrder[None]):
     candidate: int = 0
 
 
+def reason_in(message: TerminateChild | RemoveChild) -> ExitReason:
+    """For which reason the child is to end. Raises SpecError: what the message has is none."""
+    if message.reason is None:
+        return SHUTDOWN
+    where = type(message).__name__
+    try:
+        return check_reason(where, unpack_exit(message.reason))
+    except msgspec.ValidationError as error:
+        raise SpecError(where, f"reason is what pack_exit gives, not {shown(message.reason)}: {error}") from error
+
+
 class ChildInfo(Message[None]):
     """One child, as `WhichChildren` tells it. `state`: running, restarting, recovering or stopped."""
 
@@ -257,7 +269,7 @@ class CountChildren(Message[ChildCounts]):
     """Ask a supervisor how many children it has."""
 
 
-class GetChildSpec(Message[Any]):
+class GetChildSpec(RuntimeCall[Any]):
     """The child's spec, with everything that was left out filled in."""
 
     id: str

@@ -15,8 +15,7 @@ from typing import Any
 from ..actors.errors import HoldfastError
 from ..actors.kernel import lifecycle, mailbox
 from ..actors.kernel.context import ActorContext
-from ..actors.kernel.envelope import LEAVE, Ask, AskHandle, Envelope, Item, ReplyHandle
-from ..actors.kernel.message import Refusal
+from ..actors.kernel.envelope import LEAVE, Ask, Envelope, Item, ReplyHandle, fail
 from .admin import StartChild
 
 
@@ -90,13 +89,7 @@ async def answered(ctx: ActorContext, handle: ReplyHandle[Any], work: Coroutine[
     item = ctx._item
     try:
         reply = await work
-    except Refusal as no:
-        ask = handle.ask if isinstance(handle, AskHandle) else None
-        if ask is None:
-            ctx._cell.node.refused(ctx._cell, item, no)
-        else:
-            ask.fail(no)
     except HoldfastError as error:
-        handle.fail(error)
+        fail(ctx, handle, item, error)
     else:
         handle.reply(reply)

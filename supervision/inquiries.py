@@ -8,7 +8,7 @@ from typing import Any
 
 from ..actors.errors import HoldfastError
 from ..actors.kernel.actor import Actor, on
-from ..actors.kernel.envelope import ReplyHandle
+from ..actors.kernel.envelope import ReplyHandle, refuse
 from .admin import (
     Boxed,
     ChildCounts,
@@ -78,6 +78,4 @@ class Inquiries(Actor):
 
     def _fail(self, error: HoldfastError) -> ReplyHandle[Any]:
         """Answer an admin call with an error: it is the caller's business, not our crash."""
-        handle = self.ctx.reply_handle()
-        handle.fail(error)
-        return handle
+        return refuse(self.ctx, error)

@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 
 from ..actors.errors import HoldfastError, SpecError, StartFailed, StartIgnored
 from ..actors.events import AutoShutdown, ChildRestarted, ChildStartFailed, ChildTerminated, SupervisorGaveUp
-from ..actors.exit_reasons import SHUTDOWN, ExitReason, Shutdown, crash, unpack_exit
+from ..actors.exit_reasons import SHUTDOWN, Crash, ExitReason, Shutdown, crash
 from ..actors.kernel import lifecycle
 from ..actors.kernel.actor import Start, on
 from ..actors.kernel.cell import DOWN, GONE, Cell, GivenName
@@ -31,6 +31,7 @@ from .admin import (
     StartChild,
     TerminateChild,
     opened,
+    reason_in,
 )
 from .awaited import LOOK_AGAIN, Prospects, tell_wait
 from .children import (
@@ -545,6 +546,8 @@ class Supervisor(Inquiries):
             self._blame(one, str(reason))
         node = self.ctx._cell.node
         node.supervised.gave_up = SupervisorGaveUp(self.ctx.path, one.spec.id, reason)
+        if isinstance(reason, Crash):
+            node.supervised.crashed = node.supervised.gave_up
         node.emit(node.supervised.gave_up)
         self.ctx.stop(told)
 
@@ -782,7 +785,7 @@ class Supervisor(Inquiries):
         return self._answered(self._remove(message))
 
     async def _remove(self, message: RemoveChild) -> None:
-        by = self._asker()
+        by, reason = self._asker(), reason_in(message)
         if message.candidate:
             one = self._candidate(message.id, message.candidate)
             if one is None:
@@ -793,7 +796,6 @@ class Supervisor(Inquiries):
             one = self._child(message.id)
             self._parked.add(message.id)
         self._forget(one)  # From here on nobody starts it again, with others or by itself.
-        reason = SHUTDOWN if message.reason is None else unpack_exit(message.reason)
         await self._stop(one, reason, by=by, because="it was removed by order")
         if self._has_lost(one):
             raise NoSuchChild(message.id)
@@ -810,8 +812,7 @@ class Supervisor(Inquiries):
         return self._answered(self._terminate(message))
 
     async def _terminate(self, message: TerminateChild) -> None:
-        by, one = self._asker(), self._child(message.id)
-        reason = SHUTDOWN if message.reason is None else unpack_exit(message.reason)
+        by, one, reason = self._asker(), self._child(message.id), reason_in(message)
         if message.parks:
             self._parked.add(one.spec.id)
         await self._stop(one, reason, by=by, because="it was stopped by order")

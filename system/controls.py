@@ -34,7 +34,7 @@ from ..actors.errors import (
     StillEnding,
 )
 from ..actors.events import ActorResumed, ActorSuspended, EventStream
-from ..actors.exit_reasons import KILLED, SHUTDOWN, ExitReason
+from ..actors.exit_reasons import KILLED, SHUTDOWN, ExitReason, check_reason
 from ..actors.kernel import lifecycle
 from ..actors.kernel.actor import Actor, Start
 from ..actors.kernel.cell import Cell
@@ -339,7 +339,9 @@ class Controls:
 
         Raises:
             StillEnding: it has not ended within `timeout` seconds; an end that was asked for is not taken back.
+            SpecError: the reason is none of the library's.
         """
+        check_reason("terminate", reason)
         cell = self._living(target)
         check_seconds(cell.path, "timeout", timeout)
         gone = cell.ended()

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from ..actors.errors import ActorStopped, AskTimeout, HoldfastError
 from ..actors.kernel.blocking_handlers import LOOK_AGAIN, wait_on_loop
 from ..actors.kernel.message import Message
-from ..actors.kernel.ref import DEFAULT_TIMEOUT, ActorRef
+from ..actors.kernel.ref import DEFAULT_TIMEOUT, ActorRef, cell_of
 from ..actors.seconds import check_seconds
 
 if TYPE_CHECKING:
@@ -38,6 +38,7 @@ class ThreadPortal:
         Raises:
             UnknownMessage, MailboxFull, BadMessage: as `ActorRef.tell`. ActorStopped: the system has ended.
         """
+        cell_of("tell", ref)
         outcome: concurrent.futures.Future[None] = concurrent.futures.Future()
 
         def call() -> None:
@@ -58,7 +59,7 @@ class ThreadPortal:
         Raises:
             ActorStopped, UnknownMessage, MailboxFull, BadMessage: as `ActorRef.send`.
         """
-        self._wait(ref, self._begin(ref, ref.send, message))
+        self._wait(ref, self._begin(ref, _send, ref, message))
 
     def ask(self, ref: ActorRef[Any], message: Message[R], timeout: float = DEFAULT_TIMEOUT) -> R:
         """Ask, and return the reply.
@@ -71,13 +72,13 @@ class ThreadPortal:
         Raises:
             SpecError, Refusal, AskTimeout, ActorStopped, AskFailed, RemoteCrash: as `ActorRef.ask`.
         """
-        check_seconds(ref.path, "timeout", timeout)
+        check_seconds(cell_of("ask", ref).path, "timeout", timeout)
         outcome: concurrent.futures.Future[R] = self._begin(ref, _ask, ref, message, timeout)
         return self._wait(ref, outcome, timeout)
 
     async def send_async(self, ref: ActorRef[Any], message: Message[Any]) -> None:
         """Send as `send` does, awaited on the calling thread's own event loop."""
-        await self._come(ref, self._begin(ref, ref.send, message))
+        await self._come(ref, self._begin(ref, _send, ref, message))
 
     async def ask_async(self, ref: ActorRef[Any], message: Message[R], timeout: float = DEFAULT_TIMEOUT) -> R:
         """Ask as `ask` does, awaited on the calling thread's own event loop.
@@ -92,6 +93,7 @@ class ThreadPortal:
         self, ref: ActorRef[Any], call: Callable[..., Coroutine[Any, Any, R]], *args: Any
     ) -> concurrent.futures.Future[R]:
         """Have a coroutine function run as a task of the system's loop; the future has what comes of it."""
+        cell_of("a call from a thread", ref)
         outcome: concurrent.futures.Future[R] = concurrent.futures.Future()
 
         def begin() -> None:
@@ -148,6 +150,10 @@ class ThreadPortal:
 
 def _ended(ref: ActorRef[Any]) -> ActorStopped:
     return ActorStopped(ref.path, "its system has ended")
+
+
+async def _send(ref: ActorRef[Any], message: Message[Any]) -> None:
+    await ref.send(message)
 
 
 async def _ask(ref: ActorRef[Any], message: Message[R], timeout: float) -> R:

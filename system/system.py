@@ -14,7 +14,7 @@ from ..actors.control.drain import drain as drain_queue
 from ..actors.control.wait_watch import WaitWatch
 from ..actors.errors import ActorStopped, HoldfastError, NoSuchActor, SpecError, StoreError, TreeFailed
 from ..actors.events import EventStream, LeadershipTaken, RecoveryTableUnused, ServersAnswer, ServersSilent, StandingBy
-from ..actors.exit_reasons import SHUTDOWN, ExitReason, Shutdown, pack_exit
+from ..actors.exit_reasons import SHUTDOWN, ExitReason, Shutdown, check_reason, pack_exit, raised_in
 from ..actors.kernel import lifecycle
 from ..actors.kernel.actor import Actor, Start
 from ..actors.kernel.address_host import AddressHost
@@ -29,6 +29,7 @@ from ..actors.loop_watchdog import LoopWatch
 from ..actors.process.fork.launch import check_is_program
 from ..actors.process.process_host import WorkerPlace, in_process, on_frame
 from ..actors.process.worker_pool import Workers
+from ..actors.values.path_parts import check_beside, check_topic
 from ..checkpoint.engine_calls import Called
 from ..checkpoint.home.homes import Homes
 from ..checkpoint.home.journal_home import JournalHome
@@ -417,7 +418,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
             failure, self._failure = self._failure, None
             if body is not None:  # The cancel was ours: whoever catches TreeFailed must not look cancelled.
                 body.uncancel()
-            raise failure from (None if isinstance(error, asyncio.CancelledError) else error)
+            raise failure from (failure.__cause__ if isinstance(error, asyncio.CancelledError) else error)
         self._refuse_deposed(error, self._homes.journal.engine)
 
     async def shutdown(self) -> None:
@@ -555,14 +556,17 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
         """The root supervisor is gone: if nobody asked for that, the body must hear of it."""
         if self._closing is not None or done.cancelled():
             return
-        reason, last = done.result(), self._node.supervised.gave_up
+        reason, known = done.result(), self._node.supervised
+        last, crashed = known.gave_up, known.crashed
         if isinstance(reason, Shutdown) and reason.detail:
             why = reason.detail
         else:
             why = f"its root has ended, {reason}"
             if last is not None:
                 why += f"; the last to end was {last.address}/{last.child}: {last.reason}"
-        self._fail(TreeFailed(self.name, why))
+        failure, own = TreeFailed(self.name, why), raised_in(reason)
+        failure.__cause__ = own if own is not None or crashed is None else raised_in(crashed.reason)
+        self._fail(failure)
 
     # -- starting and finding actors --------------------------------------------------------------------------------
 
@@ -633,8 +637,10 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
         Called by the actor itself, or by one below it, this returns at once: the end comes after the turn.
 
         Raises:
-            SpecError: it is a part of a mechanism, which would go on without it: `terminate` ends its life alone.
+            SpecError: the reason is none of the library's; or the actor is a part of a mechanism, which would go on
+                without it: `terminate` ends its life alone.
         """
+        check_reason("stop", reason)
         cell = self._node.meant(target)
         check_no_part(cell)
         expect_end(self._history, cell.path, "it was stopped")
@@ -743,10 +749,12 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
 
     def unregister(self, name: str) -> None:
         """Free a name; unknown ones are fine."""
+        check_beside("unregister", name)
         self._node.unregister(name)
 
     def whereis(self, name: str) -> ActorRef[Any]:
         """Return a ref to the actor with this name. Raises NoSuchActor."""
+        check_beside("whereis", name)
         cell = self._node.names.get(name)
         if cell is None:
             raise NoSuchActor(name)
@@ -754,6 +762,7 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
 
     async def publish(self, topic: str, message: Message[Any]) -> None:
         """Send to every subscriber of a topic, and return when each has accepted; it waits for room at bounded ones."""
+        check_topic("publish", topic)
         await publish(self._node, topic, message, lambda cell: cell.ref.send(message))
 
     def bind(self, owner: Target, port: str, target: Target) -> None:

@@ -13,10 +13,12 @@ import msgspec
 from ..errors import type_name
 from ..safe_state import SafeStateChange, watch
 from ..seconds import is_seconds
+from ..values.path_parts import check_topic
 from .bindings import Binding, noting
 from .blocking_handlers import in_thread
+from .codec import checking
 from .envelope import Table
-from .message import Message, RuntimeOrder
+from .message import Message, RuntimeCall, RuntimeOrder
 
 if TYPE_CHECKING:
     from ..exit_reasons import ExitReason
@@ -89,8 +91,7 @@ def on(
 
 def subscribe(topic: str) -> Callable[[F], F]:
     """Subscribe the actor to a topic from its start; goes above `@on` on a handler of that topic's messages."""
-    if not topic.startswith("/"):
-        raise ValueError(f"topic {topic!r} must start with '/'")
+    check_topic("subscribe", topic)
 
     def mark(handler: F) -> F:
         cast("Any", handler).__topics__ = (*_topics_of(handler), topic)
@@ -189,7 +190,8 @@ class Actor:
                 if handles.kind in table:
                     raise TypeError(f"{type_name(cls)} has two handlers for {type_name(handles.kind)}: see {name}")
                 turn = in_thread(handler) if handles.to_thread else handler
-                table[handles.kind] = noting(turn) if issubclass(handles.kind, RuntimeOrder) else turn
+                turn = noting(turn) if issubclass(handles.kind, RuntimeOrder) else turn
+                table[handles.kind] = checking(turn) if issubclass(handles.kind, RuntimeCall) else turn
                 declared[handles.kind] = handles
             if subscribed and not marks:
                 raise TypeError(f"{type_name(cls)}.{name} has @subscribe without @on: nothing would ever reach it")

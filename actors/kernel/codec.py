@@ -26,15 +26,17 @@ from ..errors import (
     error_text,
     rebuild_error,
     remote_crash,
+    shown,
     type_name,
 )
 from ..values.arrays import described_dtype
 from .cell import GONE
-from .envelope import ReplyHandle
-from .message import Message, Refusal, UnknownRefusal, find_refusal, message_name, reply_type
+from .envelope import ReplyHandle, refuse
+from .message import Message, Refusal, RuntimeCall, UnknownRefusal, find_refusal, message_name, reply_type
 from .ref import ActorRef
 
 if TYPE_CHECKING:
+    from .actor import Actor
     from .cell import Cell
 
 MAX_BYTES = 16 * 1024 * 1024
@@ -389,6 +391,41 @@ def misfit(kind: type[msgspec.Struct], error: msgspec.MsgspecError) -> str:
     for place, name in enumerate(kind.__struct_fields__):
         text = text.replace(f"`$[{place}]", f"`{name}")
     return text
+
+
+def misfit_of(message: RuntimeCall[Any]) -> str:
+    r"""Why a message could not come from another process as it is; "" if it could, or holds what is never sent there.
+
+    >>> class Pick(RuntimeCall[None]):
+    ...     id: str
+    >>> misfit_of(Pick("a")), misfit_of(Pick(["a"])), misfit_of(Pick("half: \ud800"))
+    ('', 'Expected `str`, got `array` - at `id`', "Expected text that can be written, got 'half: \\ud800' - at `id`")
+    """
+    kind = type(message)
+    values = msgspec.structs.astuple(message)
+    for name, value in zip(kind.__struct_fields__, values, strict=True):
+        if isinstance(value, str) and not value.isascii():
+            try:
+                value.encode()
+            except UnicodeEncodeError:
+                return f"Expected text that can be written, got {shown(value)} - at `{name}`"
+    try:
+        msgspec.convert(values, kind, builtin_types=(bytes,))
+    except Exception as error:  # What a field holds may raise what it likes while it is looked at.
+        return misfit(kind, decode_error(error))
+    return ""
+
+
+def checking(handler: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+    """The handler of a call, which refuses one whose fields are not what its class declares."""
+
+    @functools.wraps(handler)
+    def turn(actor: Actor, message: RuntimeCall[Any]) -> Any:
+        if problem := misfit_of(message):
+            return refuse(actor.ctx, BadMessage(actor.ctx.path, type_name(type(message)), problem))
+        return handler(actor, message)
+
+    return turn
 
 
 def too_large(value: object, size: int) -> str:

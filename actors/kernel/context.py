@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, TypeVar, TypeVa
 from ..effects import EffectCall, FailedAttempt, Isolation, Retry, effect_of
 from ..errors import ActorStopped, AskDeadlock, HoldfastError, SpecError, remote_crash
 from ..events import EffectRetried
-from ..exit_reasons import NORMAL, ExitReason
+from ..exit_reasons import NORMAL, ExitReason, check_reason
 from ..seconds import check_seconds
+from ..values.path_parts import check_topic
 from . import links, mailbox
 from .bindings import note_order
 from .blocking_handlers import is_async
@@ -38,6 +39,7 @@ from .envelope import (
 )
 from .links import Monitor
 from .message import Message, reply_type, require_message
+from .ref import cell_of
 from .timers import LoopTimer, Timer
 from .topics import NOT_TAKEN, publish
 
@@ -243,17 +245,17 @@ class ActorContext:
 
     def forward(self, to: ActorRef[Any]) -> None:
         """Hand the message in hand on: the receiver sees the original sender, and its reply goes to the asker."""
+        cell = cell_of("ctx.forward", to)
         self._alive()
         item = self._item
         if isinstance(item, Ask):
-            cell: Cell = to._cell
             cell.require(item.message)
             self._cell.item = Stashed.of(item)
             cell.take_in(cell, item)
         elif isinstance(item, Envelope):
-            to._cell.take_in(to._cell, Envelope(item.message, item.sender))
+            cell.take_in(cell, Envelope(item.message, item.sender))
         else:
-            to._cell.take_in(to._cell, message_in(item))  # The item of a timer or a pipe is of this life.
+            cell.take_in(cell, message_in(item))  # The item of a timer or a pipe is of this life.
 
     def reply_handle(self) -> ReplyHandle[Any]:
         """Return the right to answer the ask in hand later: `return self.ctx.reply_handle()`, keep it, call `reply`."""
@@ -293,6 +295,7 @@ class ActorContext:
         Not at itself, for it would wait for its own turn: without recovery what finds its own mailbox full is a dead
         letter there.
         """
+        check_topic("ctx.publish", topic)
         uplink = self._cell.node.ports.uplink
         if uplink is not None:  # The subscribers are known to the root only.
             self._alive()
@@ -634,30 +637,35 @@ class ActorContext:
         Whoever traps exits is told by `on_exit` instead. If nobody lives there now, also because the other one waits
         for its restart, EXIT with `NoProc` comes at once: link again when it is back, not in `on_exit`.
         """
+        to = cell_of("ctx.link", other)
         self._alive()
-        links.link(self._cell, other._cell.living)
+        links.link(self._cell, to.living)
 
     def unlink(self, other: ActorRef[Any]) -> None:
         """Remove a link; nothing more comes from it."""
-        links.unlink(self._cell, other._cell.living)
+        links.unlink(self._cell, cell_of("ctx.unlink", other).living)
 
     def monitor(self, other: ActorRef[Any]) -> Monitor:
         """`on_down` hears of the end of the present life there."""
+        of = cell_of("ctx.monitor", other)
         self._alive()
-        return links.monitor(self._cell, other._cell.living, for_good=False)
+        return links.monitor(self._cell, of.living, for_good=False)
 
     def watch(self, other: ActorRef[Any]) -> Monitor:
         """`on_down` hears once, when the address is gone for good."""
+        of = cell_of("ctx.watch", other)
         self._alive()
-        return links.monitor(self._cell, other._cell.living, for_good=True)
+        return links.monitor(self._cell, of.living, for_good=True)
 
     def subscribe(self, topic: str) -> None:
         """Get what is published there from now on."""
+        check_topic("ctx.subscribe", topic)
         self._alive()
         self._cell.node.topics.subscribe(topic, self._cell)
 
     def unsubscribe(self, topic: str) -> None:
         """Receive no more of what is published on a topic."""
+        check_topic("ctx.unsubscribe", topic)
         self._cell.node.topics.unsubscribe(topic, self._cell)
 
     def _bound(self, port: str) -> ActorRef[Any] | None:
@@ -667,7 +675,16 @@ class ActorContext:
         return None if target is None else target.ref
 
     def stop(self, reason: ExitReason = NORMAL) -> None:
-        """End this life after the turn in hand."""
+        """End this life after the turn in hand, as Erlang's `{stop, Reason, State}`.
+
+        Args:
+            reason: what the supervisor, links and monitors are told: `NORMAL`, `Shutdown("TEXT")` for another end in
+                good order (its detail is text), or any exit reason that came from elsewhere. To crash, raise.
+
+        Raises:
+            SpecError: it is no exit reason of the library's. The life goes on if you catch that.
+        """
+        check_reason("ctx.stop", reason)
         self._alive()
         self._cell.request_stop(reason)
 

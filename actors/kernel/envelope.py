@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
 import msgspec
 
-from ..errors import AskTimeout, HoldfastError, UnknownMessage, type_name
+from ..errors import AskTimeout, BadMessage, HoldfastError, SpecError, UnknownMessage, shown, type_name
 from .message import Message, MessageText, Refusal, by_name, message_of
 
 if TYPE_CHECKING:
@@ -326,8 +326,22 @@ class ReplyHandle(Generic[R]):
         raise NotImplementedError
 
     def fail(self, error: HoldfastError) -> None:
-        """Answer with a Refusal, or another error of the library, which the asker's `await` raises."""
+        """Answer with a Refusal, or another error of the library, which the asker's `await` raises.
+
+        Raises:
+            SpecError: it is no such error.
+        """
         raise NotImplementedError
+
+
+def require_error(error: object) -> None:
+    """Refuse what is no answer by an error. Raises SpecError."""
+    if not isinstance(error, HoldfastError):
+        if isinstance(error, type) and issubclass(error, HoldfastError):
+            hint = f"give an instance, {error.__name__}(...)"
+        else:
+            hint = "derive a class of your own from hf.Refusal, or raise the exception in the turn, which is a crash"
+        raise SpecError("ReplyHandle.fail", f"takes a Refusal or another HoldfastError, not {shown(error)}: {hint}")
 
 
 class AskHandle(ReplyHandle[R]):
@@ -348,5 +362,20 @@ class AskHandle(ReplyHandle[R]):
             self._ask.answer(value)
 
     def fail(self, error: HoldfastError) -> None:
+        require_error(error)
         if self._ask is not None:
             self._ask.fail(error)
+
+
+def refuse(ctx: ActorContext, error: HoldfastError) -> ReplyHandle[Any]:
+    """Answer the call in hand with an error; if nobody has asked, that is logged. The actor goes on."""
+    handle: ReplyHandle[Any] = ctx.reply_handle()
+    fail(ctx, handle, ctx._item, error)
+    return handle
+
+
+def fail(ctx: ActorContext, handle: ReplyHandle[Any], item: object, error: HoldfastError) -> None:
+    """Answer by an error through a handle for `item`; if nobody has asked, and it is the call that is wrong, log it."""
+    handle.fail(error)
+    if isinstance(handle, AskHandle) and handle.ask is None and isinstance(error, (Refusal, BadMessage, SpecError)):
+        ctx._cell.node.refused(ctx._cell, item, error)

@@ -485,6 +485,8 @@ async def _farewell(cell: Cell, end: End, says: bool) -> None:
         result = actor.on_stop(end.reason)
         if asyncio.iscoroutine(result):
             result = await result
+        if isinstance(result, ExitReason):
+            exit_reasons.check_reason("on_stop", result)
     except BaseException as error:  # A failing hook must not keep the end from being told.
         result = exit_reasons.crash(error)
         cell.node.emit(HookFailed(cell.path, "on_stop", result))
@@ -723,7 +725,11 @@ class ChildExit(Item):
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
-        return actor.child_exited(item.child, item.life, item.reason)
+        try:
+            return actor.child_exited(item.child, item.life, item.reason)
+        except Exception as error:
+            error.add_note(f"raised while {actor.ctx.path} handled the end of {item.child.path}")
+            raise
 
     def undelivered(self, cell: Cell, reason: str) -> None:
         retire(self.child, "its supervisor has stopped")

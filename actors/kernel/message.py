@@ -34,7 +34,14 @@ class Message(msgspec.Struct, Generic[R], frozen=True, array_like=True):
     """
 
 
-class RuntimeOrder(Message[R], Generic[R], repr_omit_defaults=True):
+class RuntimeCall(Message[R], Generic[R]):
+    """Base of the runtime's messages that users send to its own actors.
+
+    Where it is handled its fields are checked, as those of every message are that comes from another process.
+    """
+
+
+class RuntimeOrder(RuntimeCall[R], Generic[R], repr_omit_defaults=True):
     """Base of messages that are orders of the runtime: they start or end lives, or change what runs.
 
     From another process only whoever was granted the receiver's address may send them there. Their text has what was

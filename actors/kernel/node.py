@@ -24,6 +24,7 @@ from ..errors import (
     StartFailed,
     UnknownMessage,
     WrongActor,
+    shown,
     type_name,
 )
 from ..events import DeadLetter, Event, EventHub, SupervisorGaveUp
@@ -31,6 +32,7 @@ from ..exit_reasons import ExitReason
 from ..persistence import Keeper, NothingKept
 from ..values.path_parts import check_beside, check_path_part
 from . import lifecycle
+from .actor import Actor, Start
 from .blocking_handlers import HandlerThreads
 from .cell import DOWN, GONE, RUNNING, Cell, CellKinds, GivenName, Host, Scope
 from .codec import Codec
@@ -40,12 +42,10 @@ from .lifecycle import LOCAL
 from .links import MADE_UP_NAME
 from .loop import RunLoop
 from .mailbox import Bound, Bounded, admit_bounded, admit_gone
-from .message import Refusal
 from .topics import Topics
 
 if TYPE_CHECKING:
     from ..deadline_thread import Overdue
-    from .actor import Actor, Start
     from .address_host import AddressHost
     from .ref import ActorRef, Target
 
@@ -98,18 +98,26 @@ class Ports:
     """Runs a function with its arguments in a process of its own."""
 
 
+def check_sought(path: object, kind: object) -> None:
+    """Whether this is an address, and the class of who is to live there. Raises SpecError."""
+    if not isinstance(path, str) or not isinstance(kind, type) or not issubclass(kind, Actor):
+        raise SpecError("find", f"takes an address and the class of an actor, not {shown(path)} and {shown(kind)}")
+
+
 class Supervised:
     """What the supervisors of a node have said of themselves.
 
     Attributes:
         gave_up: the last one here that did.
+        crashed: the last one here that did because of a crash: those above it give up because it has ended.
         waiting: those with children that have waited for somebody to whom they are bound; perhaps none waits any more.
     """
 
-    __slots__ = ("gave_up", "waiting")
+    __slots__ = ("crashed", "gave_up", "waiting")
 
     def __init__(self) -> None:
         self.gave_up: SupervisorGaveUp | None = None
+        self.crashed: SupervisorGaveUp | None = None
         self.waiting = weakref.WeakSet[Cell]()
 
 
@@ -296,8 +304,8 @@ class Node(RunLoop):
         if not isinstance(error, (ActorStopped, UnknownMessage)):
             self.dead_letter(cell, message, str(error), sender)
 
-    def refused(self, cell: Cell, item: Any, no: Refusal) -> None:
-        """A tell was answered with a Refusal: there is nobody to hand it to."""
+    def refused(self, cell: Cell, item: Any, no: HoldfastError) -> None:
+        """A tell was answered with a Refusal, or was no valid order: there is nobody to hand that to."""
         if self.events.hears_letters:
             known = item.sender.path if isinstance(item, Item) and item.sender is not None else ""
             self.events.emit(DeadLetter(cell.path, item, f"refused: {no}", known))
@@ -335,6 +343,8 @@ class Node(RunLoop):
         self, start: Start[Any], name: str | None = None, *, parent: Cell | None = None, mailbox: Bounded | None = None
     ) -> Cell:
         """Start an actor in this process that nobody restarts. It is up when this returns, but for its `on_start`."""
+        if not isinstance(start, Start):
+            raise SpecError("spawn", f"takes start(Class, ...), not {shown(start)}")
         cell = self.cell_below(parent if parent is not None else self.root, name)
         if mailbox is not None:
             self.bound(cell, mailbox)
@@ -401,6 +411,7 @@ class Node(RunLoop):
         """
         from .ref import ActorRef
 
+        check_sought(path, kind)
         cell = self.find(path)
         if cell is None or cell.is_dead:
             raise NoSuchActor(path)
@@ -416,7 +427,7 @@ class Node(RunLoop):
         if isinstance(target, ActorRef):
             return target._cell.living
         if not isinstance(target, str):
-            raise SpecError(repr(target), "is neither a ref nor an address")
+            raise SpecError(shown(target), "is neither a ref nor an address")
         cell = self.find(target)
         if cell is None or cell.is_dead:
             raise NoSuchActor(target)
@@ -490,9 +501,10 @@ class Node(RunLoop):
             SpecError: the class has no such binding.
         """
         kind = cell_kind(cell)
-        if kind is not None and port not in kind._bindings:
+        if not isinstance(port, str) or (kind is not None and port not in kind._bindings):
+            kind = Actor if kind is None else kind
             known = ", ".join(sorted(kind._bindings)) or "none"
-            raise SpecError(cell.path, f"{type_name(kind)} has no binding {port!r} (it has: {known})")
+            raise SpecError(cell.path, f"{type_name(kind)} has no binding {shown(port)} (it has: {known})")
         more = cell.extra()
         more.claimed = more.claimed | {port} if is_claimed else more.claimed - {port}
         if more.turn is None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Generic, Literal, TypeAlias
 
 from typing_extensions import TypeVar
 
-from ..errors import ActorRestarting, HoldfastError, SpecError
+from ..errors import ActorRestarting, HoldfastError, SpecError, shown
 from ..values.saved_refs import Addressed, hash_of_address
 from .envelope import NO_DEADLINE, Ask, in_next_pass
 from .message import Message
@@ -180,6 +180,24 @@ class ActorRef(Addressed, Generic[A_co]):
         if found is None:
             found = self._hash = hash_of_address(self._cell.path)
         return found
+
+
+def cell_of(where: str, ref: object) -> Cell:
+    """The cell that a ref leads to.
+
+    Args:
+        where: the call that it was given to.
+        ref: what was given.
+
+    Raises:
+        SpecError: it is no ref, and how to come by one.
+    """
+    if isinstance(ref, ActorRef):
+        cell: Cell = ref._cell
+        return cell
+    hint = shown(ref) if isinstance(ref, str) and ref.startswith("/") else "'/ADDRESS'"
+    find = f"ctx.find({hint}, Class), or system.ref({hint}, Class), makes one of an address"
+    raise SpecError(where, f"takes a ref, not {shown(ref)}: {find}")
 
 
 def _restarting(cell: Cell, restarting: str, sender: ActorContext | None) -> asyncio.Future[Any] | None:

@@ -34,8 +34,6 @@ class Topics:
 
     def subscribe(self, topic: str, cell: Cell) -> None:
         """From now on `cell` gets what is published; twice is once."""
-        if not topic.startswith("/"):
-            raise ValueError(f"topic {topic!r} must start with '/'")
         self._cells.setdefault(topic, {})[cell] = None
         cell.extra().belongings.topics.add(topic)
 

@@ -23,19 +23,20 @@ from ...actors.errors import (
     remote_crash,
     type_name,
 )
-from ...actors.exit_reasons import NORMAL, SHUTDOWN, ExitReason, pack_exit
+from ...actors.exit_reasons import NORMAL, SHUTDOWN, ExitReason, check_reason, pack_exit
 from ...actors.kernel.actor import Actor, Start
 from ...actors.kernel.bindings import note_order
 from ...actors.kernel.cell import Cell, Order
 from ...actors.kernel.context import NO_MESSAGE, ActorContext, StashError
-from ...actors.kernel.envelope import Ask, Item, ReplyHandle
+from ...actors.kernel.envelope import Ask, Item, ReplyHandle, require_error
 from ...actors.kernel.links import MADE_UP_NAME, Monitor
 from ...actors.kernel.message import Message, message_name, require_message
-from ...actors.kernel.node import written
-from ...actors.kernel.ref import ActorRef, current
+from ...actors.kernel.node import check_sought, written
+from ...actors.kernel.ref import ActorRef, cell_of, current
 from ...actors.kernel.timers import Timer
 from ...actors.seconds import check_seconds
 from ...actors.values import encode_value
+from ...actors.values.path_parts import check_topic
 from ...actors.values.saved_refs import SavedHandle
 from ..protocol import REPLY, SINCE_THEN, Answer, EndWanted, Feed, Perform, Performed, PipeDone, Retried
 from ..turn_word import WAITS
@@ -83,6 +84,7 @@ class RecordedReplyHandle(KeptHandle, ReplyHandle[R]):
         self._answer(life, life.answer_value(value, set, "what it has answered later"))
 
     def fail(self, error: HoldfastError) -> None:
+        require_error(error)
         life = _own_life("answers later")
         self._answer(life, life.answer_error(error))
 
@@ -292,6 +294,7 @@ class RecordedContext(ActorContext):
         """A ref to the address, whoever lives there: under replay somebody else, or nobody yet (T21)."""
         if not self._in_turn() and not self.recorded.hook:
             return super().find(path, kind)
+        check_sought(path, kind)
         node = self._cell.node
         cell = node.cell_at(path)
         return ActorRef(cell) if cell.is_dead else node.find_ref(path, kind)
@@ -344,11 +347,11 @@ class RecordedContext(ActorContext):
         return next((of.actor for future, of in outcomes if future is reply and isinstance(of, Asked)), "")
 
     def forward(self, to: ActorRef[Any]) -> None:
-        fed = self._item
+        cell, fed = cell_of("ctx.forward", to), self._item
         if not self._in_turn() or not isinstance(fed, Fed):
             raise HoldfastError(f"{self.path}: only a message in hand can be forwarded")
         feed = fed.feed
-        self.recorded.put("forward", to.path, feed.name, feed.body)
+        self.recorded.put("forward", cell.path, feed.name, feed.body)
 
     def reply_handle(self) -> ReplyHandle[Any]:
         feed = self.recorded.feed  # Its id even if nobody waits (any more): a replay must make the same handle.
@@ -363,6 +366,7 @@ class RecordedContext(ActorContext):
             self._outside()
             await super().publish(topic, message)
             return
+        check_topic("ctx.publish", topic)
         require_message(topic, message)
         body = self._cell.node.codec.encode_alike(message, topic)
         k = self.recorded.put("publish", topic, message_name(type(message)), body)
@@ -540,23 +544,27 @@ class RecordedContext(ActorContext):
             life.handle_returned()
 
     def monitor(self, other: ActorRef[Any]) -> Monitor:
-        self.acting().put("monitor", other.path)
-        return RecordedMonitor(("demonitor", other.path))
+        path = cell_of("ctx.monitor", other).path
+        self.acting().put("monitor", path)
+        return RecordedMonitor(("demonitor", path))
 
     def watch(self, other: ActorRef[Any]) -> Monitor:
-        self.acting().put("watch", other.path)
-        return RecordedMonitor(("unwatch", other.path))
+        path = cell_of("ctx.watch", other).path
+        self.acting().put("watch", path)
+        return RecordedMonitor(("unwatch", path))
 
     def link(self, other: ActorRef[Any]) -> None:
-        self.acting().put("link", other.path)
+        self.acting().put("link", cell_of("ctx.link", other).path)
 
     def unlink(self, other: ActorRef[Any]) -> None:
-        self.acting().put("unlink", other.path)
+        self.acting().put("unlink", cell_of("ctx.unlink", other).path)
 
     def subscribe(self, topic: str) -> None:
+        check_topic("ctx.subscribe", topic)
         self.acting().put("subscribe", topic)
 
     def unsubscribe(self, topic: str) -> None:
+        check_topic("ctx.unsubscribe", topic)
         self.acting().put("unsubscribe", topic)
 
     def _depart(self, owe: Callable[[Ask], int]) -> bytes:
@@ -638,6 +646,7 @@ class RecordedContext(ActorContext):
         return [msgspec.msgpack.encode(piece) for piece in self.recorded.replaced_snapshot()]
 
     def stop(self, reason: ExitReason = NORMAL) -> None:
+        check_reason("ctx.stop", reason)
         life = self.recorded
         stage, feed = life.stage, life.feed
         ends_itself = feed is not None and self._in_turn()

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from ...actors.errors import HoldfastError, RemoteCrash, StartFailed, type_name
-from ...actors.exit_reasons import NORMAL, ExitReason, unpack_exit
+from ...actors.exit_reasons import NORMAL, ExitReason, recorded_exit
 from ...actors.kernel import lifecycle
 from ...actors.kernel.actor import Actor
 from ...actors.kernel.cell import Cell
@@ -88,7 +88,7 @@ class Fed(Item, msgspec.Struct, eq=False):
                 return actor.on_start(False)
             case "exit":
                 data = node.codec.decode(dict[str, Any], feed.body)
-                reason, more = unpack_exit(data["reason"]), self.life.cell.more
+                reason, more = recorded_exit(data["reason"]), self.life.cell.more
                 if more is not None and more.trap_exits:
                     return actor.on_exit(node.cell_at(data["source"]).ref, reason)
                 if reason != NORMAL:
@@ -98,7 +98,7 @@ class Fed(Item, msgspec.Struct, eq=False):
             case "down":
                 data = node.codec.decode(dict[str, Any], feed.body)
                 return actor.on_down(
-                    node.cell_at(data["source"]).ref, unpack_exit(data["reason"]), bool(data["recovering"])
+                    node.cell_at(data["source"]).ref, recorded_exit(data["reason"]), bool(data["recovering"])
                 )
             case _:
                 error = node.codec.decode_error(CRASH, "", feed.body)

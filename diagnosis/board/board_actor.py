@@ -7,7 +7,7 @@ from collections.abc import Awaitable
 from typing import TypeVar
 
 from ...actors.kernel.actor import Actor, on
-from ...actors.kernel.message import Message, Refusal
+from ...actors.kernel.message import Message, Refusal, RuntimeCall
 from .board_frames import Measurements, Specification
 from .client import Board, BoardError
 
@@ -23,7 +23,7 @@ class BoardMeasured(Message):
     measurements: Measurements
 
 
-class SwitchChannel(Message):
+class SwitchChannel(RuntimeCall):
     """Switch a channel, 0 to 9; answered when the board has acknowledged. Refused with BoardFailed."""
 
     channel: int

@@ -6,7 +6,7 @@ import asyncio
 from typing import TypeAlias
 
 from ...actors.kernel.actor import Actor, on
-from ...actors.kernel.message import Message, Refusal
+from ...actors.kernel.message import Message, Refusal, RuntimeCall
 from .board_frames import CHANNELS
 from .board_tls import server_tls
 from .simulated_board import ROBOT, Load, SimulatedBoard
@@ -62,7 +62,7 @@ class NoSuchChannel(Refusal, text="the board has no channel {channel}: channels 
     channel: int
 
 
-class InjectFault(Message):
+class InjectFault(RuntimeCall):
     """From now on the board has this fault too."""
 
     fault: Fault
@@ -72,7 +72,7 @@ class ClearFaults(Message):
     """It has no fault any more; channels stay as they are."""
 
 
-class PowerCycle(Message):
+class PowerCycle(RuntimeCall):
     """Its own power goes and comes: connections end, and its default channels are on."""
 
 

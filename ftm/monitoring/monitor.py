@@ -21,7 +21,7 @@ import msgspec
 from ...actors.events import Event, EventHub, EventStream
 from ...actors.exit_reasons import ExitReason
 from ...actors.kernel.actor import Actor, on
-from ...actors.kernel.message import Message, RuntimeOrder
+from ...actors.kernel.message import Message, RuntimeCall, RuntimeOrder
 from ...actors.kernel.node import cell_kind
 from ...actors.kernel.ref import ActorRef
 from ...supervision.arbiter import Hand, arbiter_of
@@ -79,26 +79,26 @@ class MonitorLook(Message):
     """Look at what there is, and decide. It tells itself."""
 
 
-class Observe(Message):
+class Observe(RuntimeCall):
     """A sign was seen that is no event: `kind` is that of a threshold, or `diverged`."""
 
     kind: str
     count: int = 1
 
 
-class Measured(Message):
+class Measured(RuntimeCall):
     """Resources were measured by somebody else."""
 
     readings: Readings
 
 
-class ApplicationIs(Message):
+class ApplicationIs(RuntimeCall):
     """The application is this one now: another version, with what it declares."""
 
     application: Application
 
 
-class MechanismIs(Message):
+class MechanismIs(RuntimeCall):
     """Somebody has changed the mechanism."""
 
     layers: tuple[str, ...]
@@ -118,7 +118,7 @@ class Allow(RuntimeOrder[None]):
     layers: tuple[str, ...]
 
 
-class Object(Message[bool]):
+class Object(RuntimeCall[bool]):
     """A person does not want decision `number` to be carried out; the reply is whether that was in time."""
 
     number: int

@@ -8,7 +8,7 @@ from typing import Any
 
 from ...actors.kernel.actor import Actor, on
 from ...actors.kernel.envelope import ReplyHandle
-from ...actors.kernel.message import Message, RuntimeOrder
+from ...actors.kernel.message import Message, RuntimeCall, RuntimeOrder
 from .certificates import (
     HEARTBEAT,
     LIFETIME,
@@ -39,7 +39,7 @@ class Enrol(RuntimeOrder[bytes]):
     request: bytes
 
 
-class GetCertificate(Message[bytes]):
+class GetCertificate(RuntimeCall[bytes]):
     """The newest valid certificate of a participant (A69)."""
 
     name: str
@@ -58,11 +58,11 @@ class Revoke(RuntimeOrder[int]):
     """And not after the one with this serial number; 0: to the last one."""
 
 
-class GetRevocations(Message[bytes]):
+class GetRevocations(RuntimeCall[bytes]):
     """The list of revoked certificates, newly signed."""
 
 
-class AwaitRevocations(Message[bytes]):
+class AwaitRevocations(RuntimeCall[bytes]):
     """The list of revoked certificates, as soon as it is another one than that with the digest `known`.
 
     It comes after `HEARTBEAT` seconds, too: whoever hears nothing for longer must not believe the list it has.

@@ -12,7 +12,7 @@ from ...actors.errors import HoldfastError, SpecError
 from ...actors.exit_reasons import SHUTDOWN
 from ...actors.kernel.actor import Start, on
 from ...actors.kernel.envelope import ReplyHandle
-from ...actors.kernel.message import Message, RuntimeOrder
+from ...actors.kernel.message import Message, RuntimeCall, RuntimeOrder
 from ...actors.kernel.ref import ActorRef
 from ...actors.process.resource_limits import Limits
 from ...actors.values import state_digest
@@ -24,7 +24,7 @@ from ..supervisor_changes import Bequest
 from ..tree import supervisor
 
 
-class Route(Message[ActorRef[Any]]):
+class Route(RuntimeCall[ActorRef[Any]]):
     """Ask which partition a key belongs to; the reply is a ref to that partition."""
 
     key: Any

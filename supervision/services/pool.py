@@ -40,6 +40,10 @@ DRAIN_SECONDS = 5.0
 """How long a worker that goes may take for what it has, if nothing else is said."""
 
 
+MOST_WORKERS = 100_000
+"""Workers that a pool can be told to have."""
+
+
 class PoolStatus(msgspec.Struct, frozen=True):
     """The state of a pool: its workers, how many are up, how many on their way out, what waits at the router."""
 
@@ -170,8 +174,9 @@ class PoolSupervisor(UniformSupervisor):
         return self._answered(self._resized(message))
 
     async def _resized(self, message: ResizePool) -> int:
-        if message.size < 0 or not message.deadline >= 0:
-            raise SpecError("ResizePool", f"size and deadline must be >= 0, not {message!r}")
+        if not 0 <= message.size <= MOST_WORKERS or not message.deadline >= 0:
+            problem = f"size and deadline must be >= 0, and size at most {MOST_WORKERS}, not {message!r}"
+            raise SpecError("ResizePool", problem)
         async with self._growing:  # One after another; who goes is not waited for by who comes.
             before = len(self._crew)
             going = self._crew[message.size :]

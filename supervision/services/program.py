@@ -22,7 +22,7 @@ from ...actors.events import HookFailed, LogLine, ProcessDied, ProcessStarted
 from ...actors.exit_reasons import ExitReason
 from ...actors.kernel.actor import Actor, on, start
 from ...actors.kernel.cell import Cell
-from ...actors.kernel.message import Message, Refusal
+from ...actors.kernel.message import Message, Refusal, RuntimeCall
 from ...actors.kernel.ref import ActorRef
 from ...actors.process.fork.launch import outside_environment
 from ...actors.process.program.external_program import KeptProgram, ProgramFailed
@@ -55,7 +55,7 @@ class ProgramInfo(Message[ProgramStatus]):
     """Asks a `Program` how it is."""
 
 
-class ProgramInput(Message[None]):
+class ProgramInput(RuntimeCall[None]):
     """Something for a `Program` to read: `text` (as UTF-8), then `data`; after `end` it finds the end of its input.
 
     The reply says that it is on its way, not that it has been read.

@@ -16,14 +16,14 @@ from typing import Any, Literal
 
 import msgspec
 
-from ...actors.errors import ActorStopped, HoldfastError
+from ...actors.errors import ActorStopped, BadMessage, HoldfastError
 from ...actors.events import StoreRefused
 from ...actors.exit_reasons import ExitReason
 from ...actors.kernel.actor import Actor, on
 from ...actors.kernel.cell import DOWN, GONE, Cell
-from ...actors.kernel.envelope import Ask, ReplyHandle
+from ...actors.kernel.envelope import Ask, ReplyHandle, refuse
 from ...actors.kernel.links import Monitor
-from ...actors.kernel.message import Message, Refusal
+from ...actors.kernel.message import Message, Refusal, RuntimeCall
 from ...actors.kernel.ref import ActorRef
 from ...actors.persistence import ENTRIES, entries_key
 from ...actors.process.wire.peer import OutsideHost
@@ -59,7 +59,7 @@ class RegistryRow(msgspec.Struct, frozen=True, array_like=True):
     value: Any
 
 
-class Register(Message[None]):
+class Register(RuntimeCall[None]):
     """Hold a key. `life` is the sender's, 0 if it is recorded (its replay must send the same)."""
 
     key: bytes
@@ -67,7 +67,7 @@ class Register(Message[None]):
     life: int
 
 
-class Find(Message[list[RegistryRow]]):
+class Find(RuntimeCall[list[RegistryRow]]):
     """The entries of a key, of a holder, of both, or all."""
 
     key: bytes | None = None
@@ -78,14 +78,14 @@ class Count(Message[int]):
     """How many entries there are."""
 
 
-class DropEntries(Message[int]):
+class DropEntries(RuntimeCall[int]):
     """Give up the sender's entries for a key: those numbered, or all. The reply is how many these were."""
 
     key: bytes
     numbers: list[int] | None = None
 
 
-class ReplaceValue(Message[bool]):
+class ReplaceValue(RuntimeCall[bool]):
     """Put another value into an entry of the sender's; False if it is gone."""
 
     key: bytes
@@ -93,7 +93,7 @@ class ReplaceValue(Message[bool]):
     value: Any
 
 
-class Lock(Message[None]):
+class Lock(RuntimeCall[None]):
     """Have a key's lock; the reply is that it is had."""
 
     key: bytes
@@ -101,27 +101,27 @@ class Lock(Message[None]):
     life: int
 
 
-class Unlock(Message[None]):
+class Unlock(RuntimeCall[None]):
     """Give a lock back, or up."""
 
     key: bytes
     ticket: str
 
 
-class PutMeta(Message[None]):
+class PutMeta(RuntimeCall[None]):
     """Keep a value that belongs to the registry itself."""
 
     name: str
     value: Any
 
 
-class GetMeta(Message[list[Any]]):
+class GetMeta(RuntimeCall[list[Any]]):
     """Such a value: a list of one, or an empty one."""
 
     name: str
 
 
-class DeleteMeta(Message[None]):
+class DeleteMeta(RuntimeCall[None]):
     """Forgets a value that belongs to the registry as a whole."""
 
     name: str
@@ -242,22 +242,27 @@ class RegistryActor(Actor):
     # -- who holds what ---------------------------------------------------------------------------------------------
 
     @on(Register)
-    def _register(self, message: Register) -> None:
+    def _register(self, message: Register) -> ReplyHandle[Any] | None:
         """A unique key has one living holder; a recorded one has one entry for a key, and may say it again."""
         holder = self._sender()
         if not is_living(holder, message.life):
-            return  # Its ask has outlived it.
+            return None  # Its ask has outlived it.
+        try:
+            key_of(message.key)
+        except msgspec.DecodeError as error:
+            return refuse(self.ctx, BadMessage(self.ctx.path, "Register", f"Expected a packed key - at `key`: {error}"))
         holdings = self._book.holders.get(holder)
         for entry in () if holdings is None else holdings.entries:
             if entry.key == message.key and 0 in (entry.life, message.life):
                 entry.life, entry.value = message.life, message.value
                 self._note(holder)
-                return
+                return None
         if (other := self._in_the_way(message.key)) is not None:
             raise KeyTaken(other.holder.ref)
         self._enter(message.key, holder, message.life, message.value)
         if message.life == 0:
             self._note(holder)
+        return None
 
     def _in_the_way(self, key: bytes) -> HeldKey | None:
         """The entry of a living actor that has this key, if only one may have it."""

@@ -18,7 +18,7 @@ from typing_extensions import TypeVar
 from ...actors.errors import ActorStopped, SendError, SpecError, type_name
 from ...actors.kernel.actor import Start
 from ...actors.kernel.message import Message, Refusal
-from ...actors.kernel.ref import DEFAULT_TIMEOUT, ActorRef, current
+from ...actors.kernel.ref import DEFAULT_TIMEOUT, ActorRef, cell_of, current
 from ..spec import ChildSpec, Restart, Shutdown
 from .registrar import (
     Count,
@@ -111,6 +111,7 @@ class Registry(Generic[K, V]):
     __slots__ = ("ref", "timeout")
 
     def __init__(self, ref: ActorRef[RegistryActor], timeout: float = DEFAULT_TIMEOUT) -> None:
+        cell_of("Registry", ref)
         self.ref, self.timeout = ref, timeout
 
     def __repr__(self) -> str:

@@ -17,7 +17,7 @@ from typing_extensions import TypeVar, TypeVarTuple
 from ...actors.control.orders import pack_function
 from ...actors.errors import AskTimeout, SpecError
 from ...actors.kernel.actor import Actor, Start
-from ...actors.kernel.ref import ActorRef, current
+from ...actors.kernel.ref import ActorRef, cell_of, current
 from ...actors.seconds import check_seconds
 from ..admin import StartChild, WhichChildren
 from ..spec import NAMELESS, ChildSpec, Flags, Isolation, Restart, Shutdown
@@ -83,6 +83,7 @@ class Tasks:
     __slots__ = ("ref",)
 
     def __init__(self, ref: ActorRef[TaskSupervisor]) -> None:
+        cell_of("Tasks", ref)
         self.ref = ref
 
     def __repr__(self) -> str:

@@ -175,7 +175,7 @@ async def test_a_slow_subscriber_holds_the_publisher_back(system: hf.ActorSystem
 
 @pytest.mark.parametrize("topic", ["news", ""])
 async def test_a_topic_begins_with_a_slash(system: hf.ActorSystem, topic: str) -> None:
-    with pytest.raises(ValueError, match="must start with '/'"):
+    with pytest.raises(hf.SpecError, match="must start with '/'"):
         hf.subscribe(topic)
     with pytest.raises(hf.RemoteCrash, match="must start with '/'"):
         await system.spawn(hf.start(Reader)).ask(Do(lambda actor: actor.ctx.subscribe(topic)))

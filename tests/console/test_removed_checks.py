@@ -172,8 +172,8 @@ CHECKS = {
     ),
     "a name beside an address is one line": Check(
         "actors/values/path_parts.py",
-        "    if not name or has_control(name):",
-        "    if not name:",
+        " <= LONGEST or has_control(name):",
+        " <= LONGEST:",
         OPERATE,
         "test_a_name_that_a_terminal_would_obey",
     ),

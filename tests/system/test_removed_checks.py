@@ -53,6 +53,7 @@ ALIKE = "tests/system/test_alike.py"
 STASH = "tests/system/test_stash_everywhere.py"
 UNCODABLE = "tests/system/test_uncodable.py"
 SHUTDOWN = "tests/supervision/test_shutdown.py"
+WRONG = "tests/system/test_wrong_values.py"
 
 CHECKS = {
     "who did not stand still in time is tried again": Check(
@@ -610,7 +611,7 @@ CHECKS = {
     ),
     "the specification is in the store with the states": Check(
         "system/transaction/transaction.py",
-        "        system._specifications.changed(*self._draft.below_root(), mechanisms)\n",
+        "        system._specifications.changed(*self._draft.below_root(), self._draft.gone(), mechanisms)\n",
         "        pass\n",
         KEPT,
         "test_a_root_that_is_killed and finish",
@@ -1494,8 +1495,8 @@ CHECKS = {
     ),
     "a link through a ref from before is one with who is there now": Check(
         "actors/kernel/context.py",
-        "links.link(self._cell, other._cell.living)",
-        "links.link(self._cell, other._cell)",
+        "links.link(self._cell, to.living)",
+        "links.link(self._cell, to)",
         SUPERVISORS,
         "test_a_ref_from_before",
     ),
@@ -1772,6 +1773,97 @@ CHECKS = {
         "if False:",
         "tests/system/test_two_systems.py",
         "test_a_connection_takes_servers_alone",
+    ),
+    "an actor ends for an exit reason": Check(
+        "actors/kernel/context.py",
+        '        check_reason("ctx.stop", reason)\n',
+        "",
+        WRONG,
+        "test_what_is_no_exit_reason and plain",
+    ),
+    "a recorded actor ends for an exit reason": Check(
+        "checkpoint/life/recorded_context.py",
+        '        check_reason("ctx.stop", reason)\n',
+        "",
+        WRONG,
+        "test_what_is_no_exit_reason and recorded",
+    ),
+    "who ends another one gives an exit reason": Check(
+        "system/controls.py",
+        '        check_reason("terminate", reason)\n',
+        "",
+        WRONG,
+        "test_who_stops_another_one",
+    ),
+    "who stops another one gives an exit reason": Check(
+        "system/system.py",
+        '        check_reason("stop", reason)\n',
+        "",
+        WRONG,
+        "test_who_stops_another_one",
+    ),
+    "a hook returns an exit reason": Check(
+        "actors/kernel/lifecycle.py",
+        'exit_reasons.check_reason("on_stop", result)',
+        "pass",
+        WRONG,
+        "test_a_hook_that_returns_a_wrong_reason",
+    ),
+    "a recorded reason that nobody can read ends no program": Check(
+        "actors/exit_reasons.py",
+        "    except msgspec.ValidationError as error:\n        return crash(",
+        "    except ZeroDivisionError as error:\n        return crash(",
+        WRONG,
+        "test_a_recorded_end_that_nobody_can_read",
+    ),
+    "a call with a wrong value ends no supervisor": Check(
+        "actors/kernel/actor.py",
+        "checking(turn) if issubclass(handles.kind, RuntimeCall) else turn",
+        "turn",
+        WRONG,
+        "test_a_wrong_value_in_a_call",
+    ),
+    "a call with a wrong reason ends no supervisor": Check(
+        "supervision/admin.py",
+        "    except msgspec.ValidationError as error:\n        raise SpecError(where",
+        "    except ZeroDivisionError as error:\n        raise SpecError(where",
+        WRONG,
+        "test_a_wrong_value_in_a_call",
+    ),
+    "a key of a registry is one": Check(
+        "supervision/services/registrar.py",
+        "        except msgspec.DecodeError as error:\n",
+        "        except ZeroDivisionError as error:\n",
+        WRONG,
+        "test_a_wrong_value_in_a_call",
+    ),
+    "what is published has a topic": Check(
+        "system/system.py",
+        '        check_topic("publish", topic)\n',
+        "",
+        WRONG,
+        "test_a_verb_of_the_system",
+    ),
+    "a handle answers with an error of the library": Check(
+        "actors/kernel/envelope.py",
+        "        require_error(error)\n",
+        "",
+        WRONG,
+        "test_a_verb_of_an_actor and plain",
+    ),
+    "a recorded handle answers with an error of the library": Check(
+        "checkpoint/life/recorded_context.py",
+        "        require_error(error)\n",
+        "",
+        WRONG,
+        "test_a_verb_of_an_actor and recorded",
+    ),
+    "a name can be written": Check(
+        "actors/values/path_parts.py",
+        "\\ud800-\\udfff]",
+        "]",
+        WRONG,
+        "test_a_verb_of_the_system",
     ),
 }
 
