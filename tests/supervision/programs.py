@@ -13,7 +13,7 @@ import pytest
 import holdfast as hf
 from tests.actors.process.waiting import end_of, next_event
 
-PTRACE_SEIZE, PTRACE_INTERRUPT, WALL = 0x4206, 0x4207, 0x40000000
+PTRACE_DETACH, PTRACE_SEIZE, PTRACE_INTERRUPT, WALL = 17, 0x4206, 0x4207, 0x40000000
 PYTHON = [sys.executable, "-I", "-S", "-c"]
 STUBBORN = (
     "import signal, time\nfor n in (2, 15): signal.signal(n, signal.SIG_IGN)\nprint('up', flush=True)\ntime.sleep(99)"
@@ -58,14 +58,23 @@ def keeper_of(pid: int) -> psutil.Process:
     return found
 
 
+def ptrace(request: int, pid: int) -> int:
+    call = ctypes.CDLL(None, use_errno=True).ptrace
+    call.argtypes, call.restype = [ctypes.c_long, ctypes.c_long, ctypes.c_void_p, ctypes.c_void_p], ctypes.c_long
+    return int(call(request, pid, None, None))
+
+
 def hang(pid: int) -> None:
     """Hold a child of this process as a debugger does: SIGCONT does not have it go on; SIGKILL ends it."""
-    ptrace = ctypes.CDLL(None, use_errno=True).ptrace
-    ptrace.argtypes, ptrace.restype = [ctypes.c_long, ctypes.c_long, ctypes.c_void_p, ctypes.c_void_p], ctypes.c_long
-    if ptrace(PTRACE_SEIZE, pid, None, None):
+    if ptrace(PTRACE_SEIZE, pid):
         pytest.skip(f"nobody can be held here: {os.strerror(ctypes.get_errno())}")
-    assert ptrace(PTRACE_INTERRUPT, pid, None, None) == 0
+    assert ptrace(PTRACE_INTERRUPT, pid) == 0
     os.waitpid(pid, WALL)
+
+
+def let_go(pid: int) -> None:
+    """Have one that `hang` holds go on."""
+    assert ptrace(PTRACE_DETACH, pid) == 0
 
 
 class Ends:
