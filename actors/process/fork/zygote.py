@@ -100,7 +100,7 @@ class Zygote:
             self._load(name, lambda name=name: load(name))  # type: ignore[misc]
         self._prctl(PR_SET_CHILD_SUBREAPER, 1)
         self._settle()
-        # From here on the end of the parent is an orderly one: descendants go first. If stopped by a signal we see it, too.
+        # From here on the end of the parent is an orderly one: descendants go first. We see it even if we are stopped.
         self._prctl(PR_SET_PDEATHSIG, signal.SIGCONT)
         self._send(PacketKind.READY, value=len(os.listdir("/proc/self/task")))
         return True
