@@ -61,7 +61,7 @@ async def test_a_warm_process_that_is_stopped_is_given_to_nobody() -> None:
         stopped = psutil.Process(warm)
         stopped.suspend()
         await until(lambda: stopped.status() == psutil.STATUS_STOPPED)
-        other = await system.start(hf.child("other", hf.start(Member), isolation="process"))
+        other = await system.start(hf.child("other", hf.start(Member), isolation="process", start_timeout=10.0))
         assert await other.ask(Pid(), 5) != warm
         await until(lambda: not psutil.pid_exists(warm))
 
@@ -69,7 +69,7 @@ async def test_a_warm_process_that_is_stopped_is_given_to_nobody() -> None:
 async def test_a_function_of_an_effect_goes_on() -> None:
     async with hf.ActorSystem("app", log=False) as system:
         ref = await system.start(hf.child("it", hf.start(Member)))
-        assert await ref.ask(Compute(), 30) == "it went on"
+        assert await ref.ask(Compute(), 15) == "it went on"
 
 
 async def test_whoever_writes_a_large_state_goes_on() -> None:
