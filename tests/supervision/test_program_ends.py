@@ -332,8 +332,7 @@ def helpers_of(root: int) -> list[psutil.Process]:
     return [one for one in found if "reaper.py" in " ".join(one.cmdline()) or (one.ppid() == root and one.children())]
 
 
-@pytest.mark.parametrize("stopped", [False, True], ids=["all run", "helpers are stopped"])
-@pytest.mark.parametrize("apart", [False, True])
+@pytest.mark.parametrize(("apart", "stopped"), [(False, False), (True, False), (True, True)])
 async def test_all_of_it_ends_with_a_root_that_is_killed(
     tmp_path: Path, ends: Ends, apart: bool, stopped: bool
 ) -> None:
