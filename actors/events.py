@@ -191,10 +191,22 @@ class ProcessStarted(Event, frozen=True, eq=False):
 
 
 class ProcessDied(Event, frozen=True, eq=False):
-    """An actor's OS process is gone."""
+    """An actor's OS process is gone; `asked`: a program was asked to end, and did so before it had to be killed."""
 
     pid: int
     reason: ExitReason
+    asked: bool = False
+
+
+class HelperStuck(Event, frozen=True, eq=False):
+    """A helper process of holdfast did not do its work: `found` says how it was found, and what was done.
+
+    The `helper` is the "keeper" of the program at the address, or the "fork server" of the system.
+    """
+
+    helper: str
+    pid: int
+    found: str
 
 
 class TrustBreached(Event, frozen=True, eq=False):

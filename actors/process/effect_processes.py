@@ -22,6 +22,7 @@ from ..effects import FunctionDied, FunctionRaised, fencing_token
 from ..kernel.codec import Codec
 from ..values import decode_value, encode_value
 from .fork.launch import import_path
+from .owed_answer import OwedAnswer
 
 ENTRY: Final = "holdfast.actors.process.effect_main"
 MOST_IDLE: Final = 4
@@ -70,7 +71,8 @@ class EffectProcess:
         try:
             for message in (first, request) if first else (request,):
                 await loop.sock_sendall(self._socket, len(message).to_bytes(HEADER, "little") + message)
-            return await self._read(loop, int.from_bytes(await self._read(loop, HEADER), "little"))
+            with OwedAnswer(loop, self._process.pid):
+                return await self._read(loop, int.from_bytes(await self._read(loop, HEADER), "little"))
         except (OSError, EOFError):
             code = await asyncio.to_thread(self._ended)  # It may take its time, and others want the loop.
             raise FunctionDied(f"its process has ended (exit code {code})") from None

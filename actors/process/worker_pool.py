@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from ..control.orders import ObserveTurns
 from ..control.orders_lane import order, send_call
 from ..errors import AskFailed, ProcessUnavailable, StartFailed, StartIgnored
-from ..events import TRACED, LogLine, ProcessDied, ProcessStarted, TrustBreached
+from ..events import TRACED, HelperStuck, LogLine, ProcessDied, ProcessStarted, TrustBreached
 from ..exit_reasons import KILLED, ExitReason, ForkServerDied, Hung, TrustBreach, pack_exit, unpack_exit
 from ..kernel.cell import Cell
 from ..migration.words import NO_ATTEMPT, say
@@ -22,6 +22,7 @@ from .effect_processes import EffectProcesses
 from .fork.fork_server import ForkServer
 from .fork.forked_process import Forked, has_ended
 from .fork.launch import keep_large_memory, why_not_importable
+from .owed_answer import is_stopped
 from .process_end import ProcessEnd
 from .process_watchdog import LOOKS, ProcessWatch, oom_kills
 from .program.stdout import OutputReader
@@ -97,6 +98,10 @@ class Worker(Peer):
     def is_alive(self) -> bool:
         """Whether it can be given an actor: a process ends with its fork server, but not in the same instant."""
         return self.connection.is_open and not self.server.has_ended() and not has_ended(self.forked.pidfd)
+
+    def is_ready(self) -> bool:
+        """Whether it waits for an actor; one that a signal has stopped does not."""
+        return self.is_alive() and not is_stopped(self.pid, self.server.pid)
 
     def adopt(self, cell: Cell, limits: Limits | None, died: Callable[[Cell, ExitReason], None]) -> None:
         """This process is now that of the actor at `cell`."""
@@ -359,6 +364,7 @@ class Worker(Peer):
         elif self.end.is_complete:
             self.bury()
         else:
+            self.server.expect_exits()
             self.node.loop.call_later(REAPED_WITHIN, self._bury_late)
 
     def _bury_late(self) -> None:
@@ -475,9 +481,10 @@ class Workers:
         """
         while self._ready:
             worker = self._ready.pop()
-            if worker.is_alive():
+            if worker.is_ready():
                 self._refill()
                 return worker
+            worker.kill(KILLED)
         worker = await self._fork_again() if again else await self._fork()
         self._refill()
         return worker
@@ -520,7 +527,11 @@ class Workers:
                 raise ProcessUnavailable("the system is shutting down")
             if self._server is None:
                 server = ForkServer(
-                    self._entry, self._preload, on_exit=self._on_exit, on_lost=lambda: self._on_lost(server)
+                    self._entry,
+                    self._preload,
+                    on_exit=self._on_exit,
+                    on_lost=lambda: self._on_lost(server),
+                    on_stuck=lambda found: self._on_stuck(server, found),
                 )
                 self._servers.append(server)  # Whoever is given up twice does not wait until it has ended.
                 try:
@@ -562,6 +573,11 @@ class Workers:
             worker.end.orphaned = why
         self.bury_orphans(server)
         self.node.loop.call_later(REAPED_WITHIN, functools.partial(self.bury_orphans, server, late=True))
+
+    def _on_stuck(self, server: ForkServer, found: str) -> None:
+        root = self.node.root
+        assert root is not None
+        self.node.emit(HelperStuck(root.path, "fork server", server.pid, found))
 
     def _children_of(self, server: ForkServer) -> list[Worker]:
         return [worker for worker in self._alive.values() if worker.server is server]
@@ -609,6 +625,8 @@ class Workers:
             self._refilling.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await self._refilling
+        for server in self._servers:
+            server.expect_exits()
         graves = [worker.gone() for worker in list(self._alive.values())]
         if graves:
             await asyncio.wait(graves, timeout=REAPED_WITHIN * 2)

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 
 from ...actors.process.fork.boot import PR_SET_PDEATHSIG, bind_prctl
+from ...actors.process.owed_answer import OwedAnswer
 from ...actors.streams import check_can_watch
 from ...actors.values import ByteParts
 from ..protocol import Kept, Lent, Marked, Shared, Snapshot, Unsaved
@@ -318,6 +319,7 @@ class Writer:
             raise
         self._loop.add_reader(self._report, self._read)
         self._loop.add_reader(self._life, self._reap)
+        self._owed = OwedAnswer(self._loop, self.pid)
 
     def _read(self) -> None:
         try:
@@ -340,6 +342,7 @@ class Writer:
 
     def _stop_reading(self) -> None:
         if self._report >= 0:
+            self._owed.close()
             self._loop.remove_reader(self._report)
             os.close(self._report)
             self._report = -1

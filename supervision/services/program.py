@@ -98,7 +98,7 @@ class Program(Actor):
     def __init__(self, order: ProgramPlan) -> None:
         self._order = order
         self._kept: KeptProgram | None = None
-        self._is_up = False
+        self._is_up = self._is_stopping = False
         self._lines: deque[str] = deque(maxlen=LINES)
         self._parts: dict[str, str] = {}  # of lines that have no end yet, by stream
         self._sign: Sign | None = None
@@ -149,6 +149,7 @@ class Program(Actor):
         order = self._order
         kept = KeptProgram(
             self.ctx._cell.node,
+            self.ctx.path,
             command,
             env={**_environment(order.env), **(more or {})},
             cwd=order.cwd,
@@ -258,7 +259,8 @@ class Program(Actor):
         node, kept = self.ctx._cell.node, self._kept
         assert kept is not None
         if kept.pid > 0:
-            node.emit(ProcessDied(self.ctx.path, kept.pid, ended.result()))
+            asked = self._is_stopping and not kept.was_killed
+            node.emit(ProcessDied(self.ctx.path, kept.pid, ended.result(), asked))
         if self._is_up and not self.ctx._closed:
             self.ctx.stop(ended.result())
 
@@ -288,7 +290,7 @@ class Program(Actor):
 
     async def on_stop(self, reason: ExitReason) -> None:
         """End the program: as it wants to be asked, then SIGTERM to its group, then SIGKILL to all that is left."""
-        kept = self._kept
+        kept, self._is_stopping = self._kept, True
         self._listen_no_more()
         if kept is None or kept.ended.done():
             return

@@ -21,6 +21,7 @@ from ...actors.events import (
     DeadLetter,
     Event,
     HeldMessages,
+    HelperStuck,
     HookFailed,
     JournalBlocked,
     JournalFull,
@@ -149,8 +150,8 @@ class LogSink:
         match event:
             case ActorCrashed():
                 self._hold(event)
-            case ProcessDied(reason=reason):
-                if not reason.is_clean and not self._is_told_by_crash(event):
+            case ProcessDied(reason=reason, asked=asked):
+                if not reason.is_clean and not asked and not self._is_told_by_crash(event):
                     self._hold(event)
             case ChildTerminated():
                 self._write(self._crash_at(event.address) or event, restarts=event.restarts, allowed=event.allowed)
@@ -304,6 +305,7 @@ WRITTEN: dict[type, tuple[int, str]] = {
     ShutdownError: (logging.WARNING, "shutdown error"),
     StopOverdue: (logging.ERROR, "stop overdue"),
     OrderHeld: (logging.WARNING, "order held"),
+    HelperStuck: (logging.WARNING, "helper stuck"),
     TrustBreached: (logging.ERROR, "trust breached"),
     BindingAwaited: (logging.WARNING, "binding awaited"),
     AutoShutdown: (logging.INFO, "auto shutdown"),

@@ -242,6 +242,9 @@ class SimulatedServer:
         """Never."""
         return False
 
+    def expect_exits(self) -> None:
+        """Nothing: simulated processes tell of their end themselves."""
+
 
 class SimulatedWorker(Worker):
     """The root's side of a simulated process: all of it is the real one's but what only the kernel can tell."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import sys
 from typing import Any
@@ -12,6 +13,7 @@ import pytest
 import holdfast as hf
 from tests.actors.process.waiting import end_of, next_event
 
+PTRACE_DETACH, PTRACE_SEIZE, PTRACE_INTERRUPT, WALL = 17, 0x4206, 0x4207, 0x40000000
 PYTHON = [sys.executable, "-I", "-S", "-c"]
 STUBBORN = (
     "import signal, time\nfor n in (2, 15): signal.signal(n, signal.SIG_IGN)\nprint('up', flush=True)\ntime.sleep(99)"
@@ -54,6 +56,25 @@ def keeper_of(pid: int) -> psutil.Process:
     assert found is not None
     assert "reaper.py" in " ".join(found.cmdline())
     return found
+
+
+def ptrace(request: int, pid: int) -> int:
+    call = ctypes.CDLL(None, use_errno=True).ptrace
+    call.argtypes, call.restype = [ctypes.c_long, ctypes.c_long, ctypes.c_void_p, ctypes.c_void_p], ctypes.c_long
+    return int(call(request, pid, None, None))
+
+
+def hang(pid: int) -> None:
+    """Hold a child of this process as a debugger does: SIGCONT does not have it go on; SIGKILL ends it."""
+    if ptrace(PTRACE_SEIZE, pid):
+        pytest.skip(f"nobody can be held here: {os.strerror(ctypes.get_errno())}")
+    assert ptrace(PTRACE_INTERRUPT, pid) == 0
+    os.waitpid(pid, WALL)
+
+
+def let_go(pid: int) -> None:
+    """Have one that `hang` holds go on."""
+    assert ptrace(PTRACE_DETACH, pid) == 0
 
 
 class Ends:

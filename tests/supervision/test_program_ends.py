@@ -18,7 +18,7 @@ import pytest
 
 import holdfast as hf
 from tests.actors.process.waiting import next_event, until
-from tests.supervision.programs import FAMILY, STUBBORN, Ends, family, info, keeper_of, python, sh
+from tests.supervision.programs import FAMILY, STUBBORN, Ends, family, hang, info, keeper_of, python, sh
 from tests.warm import own_children
 
 
@@ -209,19 +209,17 @@ async def test_the_next_one_begins_when_the_last_one_of_a_killed_actor_is_gone(
 
 
 async def test_however_long_that_takes(system: hf.ActorSystem) -> None:
+    """Here that is two seconds: its keeper hangs, and is killed."""
     ref = await system.start(sh("exec sleep 99"))
     before = (await info(system)).pid
     keeper = keeper_of(before)
-    keeper.suspend()  # It ends nothing now.
+    hang(keeper.pid)
     with system.events() as events:
-        try:
-            ref.kill()
-            await next_event(events, hf.events.ActorStarted)
-            for _ in range(10):
-                await asyncio.sleep(0)
-            assert own_children() == [keeper], "nothing else is started"
-        finally:
-            keeper.resume()
+        ref.kill()
+        await next_event(events, hf.events.ActorStarted)
+        for _ in range(10):
+            await asyncio.sleep(0)
+        assert own_children() == [keeper], "nothing else is started"
         assert (await next_event(events, hf.events.ProcessDied)).pid == before
         assert (await next_event(events, hf.events.ProcessStarted)).pid == (await info(system)).pid
 
@@ -328,8 +326,16 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.parametrize("apart", [False, True])
-async def test_all_of_it_ends_with_a_root_that_is_killed(tmp_path: Path, ends: Ends, apart: bool) -> None:
+def helpers_of(root: int) -> list[psutil.Process]:
+    """Its fork server, and the keepers."""
+    found = psutil.Process(root).children(recursive=True)
+    return [one for one in found if "reaper.py" in " ".join(one.cmdline()) or (one.ppid() == root and one.children())]
+
+
+@pytest.mark.parametrize(("apart", "stopped"), [(False, False), (True, False), (True, True)])
+async def test_all_of_it_ends_with_a_root_that_is_killed(
+    tmp_path: Path, ends: Ends, apart: bool, stopped: bool
+) -> None:
     script = tmp_path / "root.py"
     script.write_text(ROOT_PROGRAM.format(family=FAMILY, apart=apart))
     with subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE) as root:
@@ -338,6 +344,11 @@ async def test_all_of_it_ends_with_a_root_that_is_killed(tmp_path: Path, ends: E
         async with asyncio.timeout(30):
             lines = [await asyncio.to_thread(root.stdout.readline) for _ in range(count)]
         ends.add(*map(int, lines))
+        helpers = helpers_of(root.pid)
+        assert len(helpers) == 1 + apart
+        for helper in helpers if stopped else ():
+            ends.add(helper.pid)
+            helper.suspend()
         root.kill()
     await ends.all()
 

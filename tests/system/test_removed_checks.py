@@ -24,6 +24,8 @@ KINDS = "tests/migration/test_moved_kinds.py"
 JOURNALS = "tests/supervision/test_dynamic_journal.py"
 LINES = "tests/supervision/test_program_lines.py"
 SILENT = "tests/supervision/test_silent_programs.py"
+KEEPERS = "tests/supervision/test_stuck_keepers.py"
+HELPERS = "tests/actors/process/test_stopped_helpers.py"
 NAMED = "tests/control/test_named_children.py"
 FAR_NAMED = "tests/control/test_far_names.py"
 SLOW = "tests/supervision/test_slow_restarts.py"
@@ -1035,6 +1037,48 @@ CHECKS = {
         "order.index(one)",
         FORK_SERVER,
         "test_a_group_is_restarted_once",
+    ),
+    "a helper that a signal has stopped is told to go on": Check(
+        "actors/process/owed_answer.py",
+        '    return state == b"T" and int(found) == parent\n',
+        "    return False\n",
+        KEEPERS,
+        "test_it_is_told",
+    ),
+    "a helper is looked at again while it owes an answer": Check(
+        "actors/process/owed_answer.py",
+        "            self._timer = self._loop.call_later(LOOK_SECONDS, self._look)\n",
+        "            pass\n",
+        HELPERS,
+        "test_a_function_of_an_effect",
+    ),
+    "a program that dies beside a keeper that hangs ends for its own reason": Check(
+        "actors/process/program/external_program.py",
+        "            self._status = self._duty.status\n",
+        "            pass\n",
+        KEEPERS,
+        "test_one_that_has_died",
+    ),
+    "a program that ends as it was asked to is no warning": Check(
+        "system/log/log_sink.py",
+        "if not reason.is_clean and not asked and not",
+        "if not reason.is_clean and not",
+        KEEPERS,
+        "test_that_it_has_ended",
+    ),
+    "a fork server is told to go on when it has a process to reap": Check(
+        "actors/process/worker_pool.py",
+        "            self.server.expect_exits()\n",
+        "",
+        HELPERS,
+        "test_a_fork_server_goes_on",
+    ),
+    "a process in reserve that is stopped is given to nobody": Check(
+        "actors/process/worker_pool.py",
+        "self.is_alive() and not is_stopped(self.pid, self.server.pid)",
+        "self.is_alive()",
+        HELPERS,
+        "test_a_warm_process",
     ),
     "all that have ended with their fork server are told of at once": Check(
         "actors/process/worker_pool.py",

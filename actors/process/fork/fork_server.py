@@ -21,6 +21,7 @@ from collections.abc import Callable, Sequence
 from ...errors import ProcessUnavailable
 from ...exit_reasons import Signal
 from ...streams import check_can_watch
+from ..owed_answer import OwedAnswer, go_on
 from .boot import HEADER, PacketKind, receive
 from .child_processes import signal_by
 from .forked_process import SOCKET_BYTES, Forked, ForkLedger, ForkRequest, fail, has_ended
@@ -46,6 +47,7 @@ class ForkServer:
             reaped, and its descendants are killed. Not called for children that end with the server.
         on_lost: called when the server has died without `stop`; its children are being killed, with what they have
             started (but for what has left their process group).
+        on_stuck: called with how it was found, and what was done, when it owed an answer and a signal had stopped it.
         fork_seconds: time limit of `fork`.
     """
 
@@ -56,6 +58,7 @@ class ForkServer:
         *,
         on_exit: Callable[[int, int], None],
         on_lost: Callable[[], None],
+        on_stuck: Callable[[str], None] = lambda found: None,
         fork_seconds: float = FORK_SECONDS,
     ) -> None:
         self.preload_errors: dict[str, str] = {}
@@ -65,7 +68,7 @@ class ForkServer:
         self.threads = 0
         """Threads in the server when it was ready. All but one were started by modules; a fork does not copy them."""
         self._entry, self._preload = entry, list(preload)
-        self._on_exit, self._on_lost = on_exit, on_lost
+        self._on_exit, self._on_lost, self._on_stuck = on_exit, on_lost, on_stuck
         self._fork_seconds = fork_seconds
         self._process: subprocess.Popen[bytes] | None = None
         self._pidfd = -1
@@ -112,7 +115,8 @@ class ForkServer:
         try:
             self._exec()
             async with asyncio.timeout(IMPORT_SECONDS):
-                await self._ready
+                with self._owed():
+                    await self._ready
         except BaseException as error:
             await self.stop(0.0)
             if isinstance(error, TimeoutError):
@@ -156,11 +160,23 @@ class ForkServer:
             return
         try:
             async with asyncio.timeout(timeout):
-                await self._ended.wait()
+                with self._owed():
+                    await self._ended.wait()
         except TimeoutError:
             if self._pidfd >= 0:  # it may have ended in the very tick the time was up
                 signal_by(self._pidfd, signal.SIGKILL)
             await self._ended.wait()
+
+    def _owed(self) -> OwedAnswer:
+        return OwedAnswer(self._loop, self.pid, self._was_stopped)
+
+    def _was_stopped(self) -> None:
+        self._on_stuck("it was stopped by a signal, and was told to go on")
+
+    def expect_exits(self) -> None:
+        """Children have ended: the server is told to go on if a signal has stopped it, so that it reaps them now."""
+        if self._pidfd >= 0 and go_on(self.pid):
+            self._was_stopped()
 
     def _on_death(self) -> None:
         """The server's pidfd is readable: it has ended."""
@@ -211,7 +227,8 @@ class ForkServer:
         seconds = self._fork_seconds + (IMPORT_SECONDS if self._loading else 0.0)
         try:
             async with asyncio.timeout(seconds), self._slots:
-                return await self._fork()
+                with self._owed():
+                    return await self._fork()
         except TimeoutError:
             self.is_deaf = True
             raise ProcessUnavailable(f"the fork server (pid {self.pid}) did not answer within {seconds:g} s") from None

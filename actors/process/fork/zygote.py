@@ -5,7 +5,8 @@
 What it promises
     * A child is reported with a pidfd that was opened before it could be reaped: a pid never means somebody else.
     * The descendants of an actor process die with it, those that called `setsid` too: the server is their subreaper.
-    * When the parent ends, all children and descendants are killed and reaped, then the server ends.
+    * When the parent ends, all children and descendants are killed and reaped, then the server ends. If a signal has
+      stopped the server, the end of the parent has it go on.
     * When the server is killed, the kernel kills the children (PDEATHSIG), and the parent one that was stopped before
       it could ask for that; their descendants are then known to nobody.
 
@@ -99,7 +100,8 @@ class Zygote:
             self._load(name, lambda name=name: load(name))  # type: ignore[misc]
         self._prctl(PR_SET_CHILD_SUBREAPER, 1)
         self._settle()
-        self._prctl(PR_SET_PDEATHSIG, 0)  # from here on the end of the parent is an orderly one: descendants go first
+        # From here on the end of the parent is an orderly one: descendants go first. We see it even if we are stopped.
+        self._prctl(PR_SET_PDEATHSIG, signal.SIGCONT)
         self._send(PacketKind.READY, value=len(os.listdir("/proc/self/task")))
         return True
 

@@ -15,11 +15,13 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from ...errors import ActorStopped, HoldfastError, ProcessUnavailable
+from ...events import HelperStuck
 from ...exit_reasons import NORMAL, Exited, ExitReason, Hung, OutOfMemory, Signal
 from ...streams import check_can_watch
 from ..process_watchdog import ProcessWatch, oom_kills
 from ..resource_limits import Limits
 from . import reaper
+from .keeper_watch import KeeperWatch
 from .stdin import InputWriter
 from .stdout import OutputReader
 
@@ -46,6 +48,7 @@ class KeptProgram:
     def __init__(
         self,
         node: Node,
+        address: str,
         command: Sequence[str],
         *,
         env: Mapping[str, str],
@@ -58,6 +61,7 @@ class KeptProgram:
         """Begin the start.
 
         Args:
+            address: whose program it is.
             env: the whole environment.
             on_line: called with "stdout" or "stderr" and each line.
             on_part: called with that, what has come of a line that has no end yet, and that with the piece before it.
@@ -69,7 +73,7 @@ class KeptProgram:
         if not sys.platform.startswith("linux"):
             raise ProcessUnavailable(f"programs as children need Linux (pidfd, prctl); this is {sys.platform}")
         loop = self._loop = node.loop
-        self.node, self.pid, self._name = node, -1, command[0]
+        self.node, self.pid, self._address, self._name = node, -1, address, command[0]
         self.started: asyncio.Future[int] = loop.create_future()
         self.ended: asyncio.Future[ExitReason] = loop.create_future()
         self.denied: asyncio.Future[str] = loop.create_future()
@@ -128,6 +132,7 @@ class KeptProgram:
                 self._outputs.append(OutputReader(loop, fd, functools.partial(on_line, name), part))
                 undo.callback(loop.remove_reader, fd)
             undo.pop_all()
+        self._duty = KeeperWatch(loop, self._keeper, self._stuck, self._deny)
         if into >= 0:
             self.input = InputWriter(loop, into)
 
@@ -135,8 +140,7 @@ class KeptProgram:
 
     def signal(self, number: int, *, group: bool = False) -> None:
         """Send a signal to the program, or to its whole process group; nothing happens if it has ended."""
-        if self.pid > 0:
-            self._say((reaper.TO_GROUP if group else reaper.TO_PROGRAM) + b"%d" % number)
+        self._duty.signal(number, group=group)
 
     def given_up(self, error: ActorStopped) -> None:
         """The address is gone for good: nobody waits for a program by its address."""
@@ -148,10 +152,12 @@ class KeptProgram:
         if not self.ended.done():
             with contextlib.suppress(OSError):
                 self._control.shutdown(socket.SHUT_WR)
+            self._duty.owes_end()
 
-    def _say(self, packet: bytes) -> None:
-        with contextlib.suppress(OSError):  # It has ended, or was sent more signals than it can take in.
-            self._control.send(packet)
+    @property
+    def was_killed(self) -> bool:
+        """Whether it was ended from here by SIGKILL."""
+        return self._killed_for is not None
 
     def hold_output(self) -> None:
         """Hand on nothing of what it prints, so that it waits, until `let_output_go_on`, or until it has ended."""
@@ -186,19 +192,33 @@ class KeptProgram:
             case reaper.STARTED:
                 self._up(int(text))
             case reaper.FAILED:
+                self._duty.owes_end()
                 self._fail(text.decode("utf-8", "replace"))
             case reaper.ENDED:
                 self._status = int(text)
             case reaper.DENIED:
-                if not self.denied.done():
-                    self.denied.set_result(text.decode("utf-8", "replace"))
+                self._duty.excuse()
+                self._deny(text.decode("utf-8", "replace"))
             case _:
                 self._loop.remove_reader(self._control)
                 return False
         return True
 
+    def _deny(self, why: str) -> None:
+        if not self.denied.done():
+            self.denied.set_result(why)
+
+    def _stuck(self, what: str) -> None:
+        self.node.emit(HelperStuck(self._address, "keeper", self._keeper.pid, what))
+
     def _up(self, pid: int) -> None:
         self.pid = pid
+        try:
+            self._duty.started(pid)
+        except OSError as error:
+            self._fail(f"it cannot be watched: {error}")
+            self.kill()
+            return
         limits = self._limits
         if limits is not None:
             import psutil
@@ -221,7 +241,10 @@ class KeptProgram:
         while self._read():  # What it said last.
             pass
         self._control.close()
+        self._duty.close()
         code = self._keeper.wait()
+        if self._status is None:
+            self._status = self._duty.status
         reason = self._reason()
         if self._status is None and self.pid > 0:  # It was killed, and the program with it; not what that had started.
             with contextlib.suppress(ProcessLookupError, PermissionError):

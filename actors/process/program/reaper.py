@@ -6,6 +6,7 @@ What it promises
     * The program leads a session of its own and is ended, with all its descendants (those that called `setsid` too: the
       keeper is their subreaper), when its owner's process ends, however that ends, SIGKILL included.
     * The end of the program is told when nothing of it is left: who starts it anew finds its port free.
+    * If a signal has stopped the keeper, the end of its owner's process has it go on.
     * If the keeper itself is killed, the kernel kills the program (PDEATHSIG; the keeper has one thread, so the signal
       cannot come too early), and the owner the rest of its process group.
     * A program that has become another user may be out of its reach. Then it says so, stays, and tells of the end that
@@ -23,14 +24,12 @@ import sys
 TYPE_CHECKING = False  # importing `typing`, or `signal` with its enums, would take as long as all the rest
 if TYPE_CHECKING:
     import signal
-    from collections.abc import Callable
     from typing import Any, NoReturn
 else:
     import _signal as signal
 
 STARTED, FAILED, ENDED = b"S", b"F", b"E"  # to the owner: pid; why not; wait status
-DENIED = b"D"  # to the owner: why SIGKILL is refused; the keeper goes on
-TO_PROGRAM, TO_GROUP = b"P", b"G"  # to the keeper: a signal's number; the end of the socket means SIGKILL for all
+DENIED = b"D"  # to the owner: why SIGKILL is refused; the keeper goes on. The end of the socket means SIGKILL for all.
 
 PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36
 LIMITS = {"address_space_bytes": 9, "open_files": 7}  # RLIMIT_AS, RLIMIT_NOFILE
@@ -50,7 +49,7 @@ def prctl(option: int, argument: int) -> None:
 
 
 class Reaper:
-    """The loop of the keeper: signals from the owner, deaths from the kernel."""
+    """The loop of the keeper: the owner's end of the socket, deaths from the kernel."""
 
     def __init__(self, control: int, owner: int, order: dict[str, Any]) -> None:
         """`order`: command (list of str), env (dict of str), cwd (str or None), limits (dict of int by name)."""
@@ -68,6 +67,7 @@ class Reaper:
 
     def run(self) -> None:
         """Start the program and stay until nothing of it is left."""
+        prctl(PR_SET_PDEATHSIG, signal.SIGCONT)  # Stopped by a signal, we are to see the end of the owner all the same.
         owner_fd = os.pidfd_open(self._owner)
         if os.getppid() != self._owner:
             return  # It has ended already.
@@ -85,7 +85,7 @@ class Reaper:
             ready = {fd for fd, _ in poll.poll()}
             if self._wake_out in ready:
                 self._reap()
-            if owner_fd in ready or (self._control in ready and self._status is None and not self._obey()):
+            if owner_fd in ready or self._control in ready:
                 break
         self._end_all()
         self._tell(ENDED + b"%d" % (self._status or 0))
@@ -149,21 +149,6 @@ class Reaper:
                     resource.setrlimit(number, (limits[name], limits[name]))
             if limits.get("niceness"):
                 os.nice(limits["niceness"])
-
-    def _obey(self) -> bool:
-        """Do as the owner says; False: it wants an end of all."""
-        try:
-            packet = os.read(self._control, 64)
-        except OSError:
-            return False
-        if not packet:
-            return False
-        signal_it: Callable[[int, int], None] = os.killpg if packet[:1] == TO_GROUP else os.kill
-        try:
-            signal_it(self._pid, int(packet[1:]))  # It has not been reaped: the number is its own.
-        except OSError:
-            pass  # It is gone, or another user's: what follows in the end is SIGKILL, and that is told of.
-        return True
 
     # -- deaths -----------------------------------------------------------------------------------------------------
 

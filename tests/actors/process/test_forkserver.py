@@ -21,6 +21,7 @@ import pytest
 from holdfast.actors.errors import HoldfastError, ProcessUnavailable
 from holdfast.actors.process.fork.fork_server import ForkServer
 from holdfast.actors.process.fork.forked_process import Forked
+from tests.supervision.programs import hang, let_go
 
 SECONDS = 30.0
 
@@ -332,14 +333,14 @@ async def test_a_fork_under_way_fails_when_the_server_dies() -> None:
     await fixture.lost.wait()
 
 
-async def test_a_stopped_server_does_not_hang_a_fork() -> None:
+async def test_a_server_that_hangs_does_not_hang_a_fork() -> None:
     async with running(seconds=0.1) as fixture:
         before = own_descriptors()
-        os.kill(fixture.server.pid, signal.SIGSTOP)
+        hang(fixture.server.pid)
         with pytest.raises(ProcessUnavailable, match=r"did not answer within 0\.1 s"):
             await fixture.server.fork()
         assert own_descriptors() == before
-        os.kill(fixture.server.pid, signal.SIGCONT)
+        let_go(fixture.server.pid)
         # What was asked for in vain is started now, and is killed; nobody hears of it.
         fixture.server._fork_seconds = SECONDS
         child = await fixture.server.fork()
@@ -349,11 +350,11 @@ async def test_a_stopped_server_does_not_hang_a_fork() -> None:
         child.close()
 
 
-async def test_stop_of_a_stopped_server() -> None:
+async def test_stop_of_a_server_that_hangs() -> None:
     async with running() as fixture:
         child = await fixture.server.fork()
         pidfd = os.dup(child.pidfd)
-        os.kill(fixture.server.pid, signal.SIGSTOP)
+        hang(fixture.server.pid)
         await fixture.server.stop(0.05)
         wait_gone([pidfd])
         child.close()

@@ -17,6 +17,7 @@ from holdfast.actors.process import worker_pool
 from holdfast.actors.process.fork import fork_server, launch
 from tests.actors.process.players import Account, Add, Total, Where
 from tests.actors.process.waiting import until
+from tests.supervision.programs import hang
 from tests.warm import own_children
 
 
@@ -75,10 +76,10 @@ async def test_a_fork_server_that_was_replaced_ends_with_the_system(monkeypatch:
     async with hf.ActorSystem("app", log=False) as system:
         first = await system.start(account("first"))
         await warmed_up(system)
-        (stopped,) = servers()
+        (hung,) = servers()
         await system.start(account("second"))
         await warmed_up(system)
-        stopped.suspend()
+        hang(hung.pid)
         await system.start(account("third"))  # the one in reserve
         await system.start(account("fourth"))
         assert len(servers()) == 2
@@ -99,10 +100,10 @@ async def test_a_process_of_whose_end_nobody_has_told_in_time_leaves_nothing_ope
     async with hf.ActorSystem("app", log=False) as system:
         await system.stop(await system.start(account("first")))
         await warmed_up(system)
-        (stopped,) = servers()
+        (hung,) = servers()
         (reserve,) = system._workers._alive.values()
         monkeypatch.setattr(worker_pool.Worker, "_bury_soon", late)
-        stopped.suspend()
+        hang(hung.pid)
     assert servers() == []
     assert reserve.forked.pidfd == -1
 
@@ -112,12 +113,12 @@ async def test_a_fork_server_whose_start_is_given_up_twice_ends_with_the_system(
 ) -> None:
     start_server = launch.exec_server
 
-    def exec_and_stop(*args: Any) -> Any:
+    def exec_and_hang(*args: Any) -> Any:
         process = start_server(*args)
-        os.kill(process.pid, signal.SIGSTOP)  # It does not get ready before it is given up.
+        hang(process.pid)  # It does not get ready before it is given up.
         return process
 
-    monkeypatch.setattr(fork_server, "exec_server", exec_and_stop)
+    monkeypatch.setattr(fork_server, "exec_server", exec_and_hang)
     async with hf.ActorSystem("app", log=False) as system:
         starting = asyncio.ensure_future(system.start(account("first")))
         await until(lambda: bool(servers()))
