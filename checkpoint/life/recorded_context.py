@@ -188,28 +188,27 @@ class Pending(OutcomeFuture[Any]):
 
 
 class Resting(Pending):
-    """A moment or a message that a turn waits for. When it has come, or is not waited for any more, the turn rests no
-    longer for it, as its handler is about to see. (A callback would be kept as long as the turn waits.)
+    """A moment or a message that a turn waits for. Once it has come, or is not waited for any more, the turn no longer
+    rests for it. (At once: the handler may go on, or end its turn, in this very step.)
     """
 
     __slots__ = ()
 
+    def __init__(self, life: Life, k: int) -> None:
+        super().__init__(life, k)
+        life.waits.resting += (self,)
+
     def set_result(self, result: Any) -> None:
-        self._over_soon()
+        self._life.waits.rested(self)
         super().set_result(result)
 
     def set_exception(self, exception: Any) -> None:
-        self._over_soon()
+        self._life.waits.rested(self)
         super().set_exception(exception)
 
     def cancel(self, msg: Any = None) -> bool:
-        if not self.done():
-            self._life.waits.rested()  # At once: what the handler does next may leave in this very step.
+        self._life.waits.rested(self)
         return super().cancel(msg)
-
-    def _over_soon(self) -> None:
-        life = self._life
-        life.cell.node.loop.call_soon(life.waits.rested)  # In front of whoever waits for it.
 
 
 class RecordedContext(ActorContext):
@@ -448,9 +447,7 @@ class RecordedContext(ActorContext):
         self, verb: str, name: str, seconds: float, kinds: tuple[type[Message[Any]], ...], since: str = SINCE_THEN
     ) -> asyncio.Future[Any]:
         """Wait for what the home waits for: nothing of it is out."""
-        outcome = self._awaited(Resting, verb, since, name, seconds, kinds)
-        self.recorded.waits.resting += 1
-        return outcome
+        return self._awaited(Resting, verb, since, name, seconds, kinds)
 
     def _slept(self, seconds: float, *, is_moment: bool) -> asyncio.Future[None]:
         if self._in_turn():
@@ -555,7 +552,7 @@ class RecordedContext(ActorContext):
         return self.recorded.stage.owed >= 0
 
     def _rests(self) -> bool:
-        return self.recorded.waits.resting > 0 or not self.recorded.is_live
+        return bool(self.recorded.waits.resting) or not self.recorded.is_live
 
     def _turn_waits(self) -> None:
         life = self.recorded
