@@ -269,6 +269,9 @@ class Relocation(StagedWork):
 
     # -- given up -----------------------------------------------------------------------------------------------------
 
+    async def let_go(self, system: ActorSystem) -> None:
+        await self._move.give_up()
+
     async def release(self, system: ActorSystem) -> None:
         """It goes on where it is."""
         try:

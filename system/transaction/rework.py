@@ -268,6 +268,11 @@ class Rework(StagedWork):
         if switch is not None:
             refuse_unsaved(cell, switch, before)
 
+    async def let_go(self, system: ActorSystem) -> None:
+        if self._held is not None:
+            await self.release(system)
+            self._held, self._attempt = None, next(ATTEMPTS)
+
     async def release(self, system: ActorSystem) -> None:
         """It goes on as before."""
         if self._is_ordered:
