@@ -52,12 +52,14 @@ class Clinic(hf.Actor):
 class Waiting(Patient):
     """Its turns have an effect or an ask out, before they wait."""
 
+    clinic: hf.Binding[Clinic]
+
     @hf.on(Go)
     async def go(self, message: Go) -> str:
         if message.file == "effect":
             await self.ctx.effect(pause)
         if message.file == "ask":
-            await self.ctx.ref("/app/clinic", Clinic).ask(Slow())
+            await self.clinic.ask(Slow())
         return await super().go(message)
 
 
@@ -146,6 +148,8 @@ async def give_up(system: hf.ActorSystem, ref: Any, case: Case) -> None:
             kill(system, ref)
     with contextlib.suppress(hf.HoldfastError, asyncio.CancelledError):
         await work
+        if what == "suspend":  # It has come about.
+            await system.resume(ref, timeout=IN_TIME)
 
 
 def kill(system: hf.ActorSystem, ref: Any) -> None:
@@ -187,7 +191,7 @@ async def are_left(system: hf.ActorSystem, ref: Any) -> None:
     await system.resume(ref)
     await waits(system, ref.path)
     there: Any = "task" if system.pid_of(ref) != os.getpid() else "process"
-    async with asyncio.timeout(AT_ONCE), system.transaction(timeout=AT_ONCE) as change:
+    async with system.transaction(timeout=IN_TIME) as change:  # It may be the first process.
         change.isolation(ref, there)
     await waits(system, ref.path)
 
@@ -197,9 +201,12 @@ async def test_a_turn_that_waits_is_left_behind_a_change_that_was_given_up(case:
     what, _, _, wait, history = case
     async with hf.ActorSystem("app", log=False, intensity=99) as system:
         before = BEFORE.get(what) if history != "changed" else None
-        spec = hf.child("patient", hf.start(Waiting), recovery=hf.hybrid(interval=1000.0), mechanism=before)
+        clinic = await system.start(hf.child("clinic", hf.start(Clinic), recovery=hf.hybrid(interval=1000.0)))
+        spec = hf.child(
+            "patient", hf.start(Waiting), recovery=hf.hybrid(interval=1000.0), mechanism=before,
+            bindings={"clinic": clinic.path},
+        )  # fmt: skip
         ref: Any = await system.start(spec)
-        await system.start(hf.child("clinic", hf.start(Clinic), recovery=hf.hybrid(interval=1000.0)))
         await system.start(hf.supervisor("ward", children=[]))
         await has_waited(system, ref, history)
         if what in BEFORE and before is None:
