@@ -192,7 +192,7 @@ class LifeWaits:
         return bool(self.resting) and all(kind is not None or future.done() for future, kind in self.outcomes.values())
 
     def rested(self, one: asyncio.Future[Any]) -> None:
-        """It has come, or is not waited for any more; that of an earlier turn, or of one run again since, says nothing."""
+        """It has come, or is not waited for any more; if it was an earlier turn that did, nothing changes."""
         self.resting = tuple(other for other in self.resting if other is not one)
 
 

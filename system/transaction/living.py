@@ -66,9 +66,8 @@ class OnSharedWork(OnLiving):
         if self._work is not None:
             await self._work.finish(system)
 
-    async def let_go(self, system: ActorSystem) -> None:
-        if self._work is not None:
-            await self._work.let_go(system)
+    async def let_go(self, system: ActorSystem) -> bool:
+        return self._work is not None and await self._work.let_go(system)
 
     async def release(self, system: ActorSystem) -> None:
         if self._work is not None:

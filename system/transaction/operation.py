@@ -61,8 +61,9 @@ class StagedWork:
     async def finish(self, system: ActorSystem) -> None:
         """Have what runs follow what is in force. What fails here is told, and changes nothing for the others."""
 
-    async def let_go(self, system: ActorSystem) -> None:
-        """Have those that were brought to rest go on meanwhile, if that can be: `prepare` is called again."""
+    async def let_go(self, system: ActorSystem) -> bool:
+        """Have whoever was brought to rest go on meanwhile; if somebody does, `prepare` is called again."""
+        return False
 
     async def release(self, system: ActorSystem) -> None:
         """Let go of what was prepared; nothing if that is nothing."""

@@ -19,6 +19,7 @@ from .errors import TransactionFailed, TransactionRefused
 from .events import TransactionBegan, TransactionCommitted, TransactionRolledBack
 from .mechanisms import look_at_grants
 from .operation import Operation
+from .relocation import seen
 
 if TYPE_CHECKING:
     from ..system import ActorSystem
@@ -181,12 +182,14 @@ class Transaction:
             await operation.prepare(system)
             return
         work = system._node.loop.create_task(operation.prepare(system), name=operation.text)
+        work.add_done_callback(seen)  # Whoever is cancelled has no use for its error.
         is_held = True
         try:
             while not (await asyncio.wait((work,), timeout=LOOK_AGAIN))[0]:
                 if is_held and operation.is_away(system):
-                    is_held, self._loose = False, others
-                    await asyncio.gather(*(one.let_go(system) for one in {one.work for one in others}))
+                    is_held, each = False, list({one.work: one for one in others}.values())
+                    gone_on = await asyncio.gather(*(one.let_go(system) for one in each))
+                    self._loose += [one for one, goes_on in zip(each, gone_on, strict=True) if goes_on]
         finally:
             work.cancel()
             await asyncio.wait((work,))
