@@ -16,10 +16,10 @@ from tests.system.trees import Add, Counter, Stumble, ref
 
 pytestmark = pytest.mark.usefixtures("warm_programs")
 
-AWAY = 2.0
+AWAY = 3.0
 """Seconds that a restart waits."""
-HELD = 1.2
-"""Seconds that an actor may stand still at most, also on a busy machine; it is much less than the restart takes."""
+HELD = 2.5
+"""Seconds that an actor may stand still at most, also on a busy machine; it is less than the restart takes."""
 IN_TIME = 20.0
 
 
