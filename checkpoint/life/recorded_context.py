@@ -188,8 +188,8 @@ class Pending(OutcomeFuture[Any]):
 
 
 class Resting(Pending):
-    """A moment or a message that a turn waits for. Once it has come, or is not waited for any more, the turn no longer
-    rests for it. (At once: the handler may go on, or end its turn, in this very step.)
+    """A moment or a message that a turn waits for. When it has come, or is not waited for any more, the turn rests no
+    longer for it, as its handler is about to see. (A callback would be kept as long as the turn waits.)
     """
 
     __slots__ = ()
@@ -199,16 +199,20 @@ class Resting(Pending):
         life.waits.resting += (self,)
 
     def set_result(self, result: Any) -> None:
-        self._life.waits.rested(self)
+        self._over_soon()
         super().set_result(result)
 
     def set_exception(self, exception: Any) -> None:
-        self._life.waits.rested(self)
+        self._over_soon()
         super().set_exception(exception)
 
     def cancel(self, msg: Any = None) -> bool:
-        self._life.waits.rested(self)
+        self._life.waits.rested(self)  # At once: what the handler does next may leave in this very step.
         return super().cancel(msg)
+
+    def _over_soon(self) -> None:
+        life = self._life
+        life.cell.node.loop.call_soon(life.waits.rested, self)  # In front of whoever waits for it.
 
 
 class RecordedContext(ActorContext):
