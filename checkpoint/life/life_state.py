@@ -162,7 +162,7 @@ class LifeWaits:
     Attributes:
         outcomes: futures of what comes of outputs, by (turn, output), each with what it has to be.
         moment: until when the handler of the turn in hand has waited, in Unix time.
-        resting: how many moments and messages the turn in hand waits for.
+        resting: moments and messages that the turn in hand waits for, and that have not come.
         stranded: asks whose receivers have been stopped, and answer in their next lives, by (turn, output).
         heard: how many outcomes the home has told.
         order: tells the turn in hand its outcomes, one after another.
@@ -171,7 +171,7 @@ class LifeWaits:
     order: OutcomeOrder
     outcomes: dict[tuple[int, int], tuple[asyncio.Future[Any], Awaited]] = dataclasses.field(default_factory=dict)
     moment: float = 0.0
-    resting: int = 0
+    resting: tuple[asyncio.Future[Any], ...] = ()
     stranded: frozenset[tuple[int, int]] = frozenset()
     heard: int = 0
 
@@ -184,16 +184,16 @@ class LifeWaits:
     def is_open(self) -> bool:
         """Whether the turn in hand rests, or has an effect out, so that its state can be looked at beside it."""
         effects = (future for future, kind in self.outcomes.values() if isinstance(kind, EffectCall))
-        return self.resting > 0 or not all(future.done() for future in effects)
+        return bool(self.resting) or not all(future.done() for future in effects)
 
     @property
     def may_be_left(self) -> bool:
         """Whether the turn in hand rests, and all that it has let out so far was accepted."""
-        return self.resting > 0 and all(kind is not None or future.done() for future, kind in self.outcomes.values())
+        return bool(self.resting) and all(kind is not None or future.done() for future, kind in self.outcomes.values())
 
-    def rested(self) -> None:
-        """Something has come that a turn has waited for, perhaps an earlier one."""
-        self.resting = max(0, self.resting - 1)
+    def rested(self, one: asyncio.Future[Any]) -> None:
+        """It has come, or is not waited for any more; if it was an earlier turn that did, nothing changes."""
+        self.resting = tuple(other for other in self.resting if other is not one)
 
 
 @dataclasses.dataclass(slots=True)

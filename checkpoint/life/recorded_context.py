@@ -197,6 +197,10 @@ class Resting(Pending):
 
     __slots__ = ()
 
+    def __init__(self, life: Life, k: int) -> None:
+        super().__init__(life, k)
+        life.waits.resting += (self,)
+
     def set_result(self, result: Any) -> None:
         self._over_soon()
         super().set_result(result)
@@ -206,13 +210,12 @@ class Resting(Pending):
         super().set_exception(exception)
 
     def cancel(self, msg: Any = None) -> bool:
-        if not self.done():
-            self._life.waits.rested()  # At once: what the handler does next may leave in this very step.
+        self._life.waits.rested(self)  # At once: what the handler does next may leave in this very step.
         return super().cancel(msg)
 
     def _over_soon(self) -> None:
         life = self._life
-        life.cell.node.loop.call_soon(life.waits.rested)  # In front of whoever waits for it.
+        life.cell.node.loop.call_soon(life.waits.rested, self)  # In front of whoever waits for it.
 
 
 class RecordedContext(ActorContext):
@@ -469,9 +472,7 @@ class RecordedContext(ActorContext):
         self, verb: str, name: str, seconds: float, kinds: tuple[type[Message[Any]], ...], since: str = SINCE_THEN
     ) -> asyncio.Future[Any]:
         """Wait for what the home waits for: nothing of it is out."""
-        outcome = self._awaited(Resting, verb, since, name, seconds, kinds)
-        self.recorded.waits.resting += 1
-        return outcome
+        return self._awaited(Resting, verb, since, name, seconds, kinds)
 
     def _slept(self, seconds: float, *, is_moment: bool) -> asyncio.Future[None]:
         if self._in_turn():
@@ -580,7 +581,7 @@ class RecordedContext(ActorContext):
         return self.recorded.stage.owed >= 0
 
     def _rests(self) -> bool:
-        return self.recorded.waits.resting > 0 or not self.recorded.is_live
+        return bool(self.recorded.waits.resting) or not self.recorded.is_live
 
     def _turn_waits(self) -> None:
         life = self.recorded

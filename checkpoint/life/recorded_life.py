@@ -340,7 +340,7 @@ class Life:
             self.note_timers(feed)
         self.feed, self.last_k, self.stage.ending = feed, 0, None
         waits = self.waits
-        waits.moment, waits.resting = 0.0, 0
+        waits.moment, waits.resting = 0.0, ()
         if waits.stranded:
             waits.stranded = frozenset()
         if waits.order.is_used:

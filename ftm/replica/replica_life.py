@@ -137,7 +137,7 @@ class ServerLife(Life):
         """Whether the turn in hand waits for moments, messages or these asks, and nothing else of this life is out."""
         waits = self.waits
         out = [k for (_, k), (future, _) in waits.outcomes.items() if not future.done()]
-        resting = waits.resting + sum(k in stranded for k in out)
+        resting = len(waits.resting) + sum(k in stranded for k in out)
         return 0 < resting == len(out) and not (self.pipes or self.has_begun_tasks)
 
     def rewind(self, turn: int, stash: list[Fed], returned: dict[int, Fed]) -> None:

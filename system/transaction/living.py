@@ -43,6 +43,10 @@ class OnSharedWork(OnLiving):
 
     _work: StagedWork | None = None
 
+    @property
+    def work(self) -> StagedWork:
+        return self if self._work is None else self._work
+
     async def prepare(self, system: ActorSystem) -> None:
         if self._work is not None:
             await self._work.prepare(system)
@@ -61,6 +65,9 @@ class OnSharedWork(OnLiving):
     async def finish(self, system: ActorSystem) -> None:
         if self._work is not None:
             await self._work.finish(system)
+
+    async def let_go(self, system: ActorSystem) -> bool:
+        return self._work is not None and await self._work.let_go(system)
 
     async def release(self, system: ActorSystem) -> None:
         if self._work is not None:

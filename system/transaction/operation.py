@@ -61,6 +61,10 @@ class StagedWork:
     async def finish(self, system: ActorSystem) -> None:
         """Have what runs follow what is in force. What fails here is told, and changes nothing for the others."""
 
+    async def let_go(self, system: ActorSystem) -> bool:
+        """Have whoever was brought to rest go on meanwhile; if somebody does, `prepare` is called again."""
+        return False
+
     async def release(self, system: ActorSystem) -> None:
         """Let go of what was prepared; nothing if that is nothing."""
 
@@ -75,7 +79,8 @@ class Operation(StagedWork):
     5. `finish` of all: what runs follows what is in force.
 
     If something fails, is cancelled or takes too long before the commit: `release` of all whose `prepare` was begun,
-    last one first, instead of the rest.
+    last one first, instead of the rest. While the actor of one that is prepared is between two lives, the others have
+    `let_go`, and are prepared again behind it.
     """
 
     verb: ClassVar[str] = ""
@@ -100,6 +105,17 @@ class Operation(StagedWork):
     def text(self) -> str:
         """The step in words."""
         return f"{self.verb} {self.target}"
+
+    @property
+    def work(self) -> StagedWork:
+        """What does it, which may do others of the same actor too."""
+        return self
+
+    def is_away(self, system: ActorSystem) -> bool:
+        """Whether its actor is between two lives, so that the next one is waited for."""
+        place = self._found
+        cell = None if place is None or place.is_planned else place.now(system._node)
+        return cell is not None and not cell.host.is_up(cell)
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         """See whether it can be done at this point, and change the draft as the commit will change the tree.

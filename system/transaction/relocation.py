@@ -269,6 +269,11 @@ class Relocation(StagedWork):
 
     # -- given up -----------------------------------------------------------------------------------------------------
 
+    async def let_go(self, system: ActorSystem) -> bool:
+        is_begun = self._move.task is not None
+        await self._move.give_up()
+        return is_begun
+
     async def release(self, system: ActorSystem) -> None:
         """It goes on where it is."""
         try:

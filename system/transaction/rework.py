@@ -268,6 +268,13 @@ class Rework(StagedWork):
         if switch is not None:
             refuse_unsaved(cell, switch, before)
 
+    async def let_go(self, system: ActorSystem) -> bool:
+        if self._held is None:
+            return False
+        await self.release(system)
+        self._held, self._attempt = None, next(ATTEMPTS)
+        return True
+
     async def release(self, system: ActorSystem) -> None:
         """It goes on as before."""
         if self._is_ordered:

@@ -19,6 +19,7 @@ from .errors import TransactionFailed, TransactionRefused
 from .events import TransactionBegan, TransactionCommitted, TransactionRolledBack
 from .mechanisms import look_at_grants
 from .operation import Operation
+from .relocation import seen
 
 if TYPE_CHECKING:
     from ..system import ActorSystem
@@ -51,6 +52,7 @@ class Transaction:
         self._arrangement = Arrangement()
         self._draft: Draft | None = None
         self._task: asyncio.Task[Any] | None = None
+        self._loose: list[Operation] = []  # to be prepared again, for those at rest for them have been let go of
         self._problems: list[str] = []  # of what is in force, and could not be followed
 
     async def __aenter__(self) -> Change:
@@ -134,25 +136,27 @@ class Transaction:
         try:
             async with asyncio.timeout_at(deadline):
                 await system._specifications.prepare()
-                for operation in operations:
-                    at, failed = operation, operation.text
-                    begun.append(operation)  # Before it is prepared: it may be cancelled in the middle.
-                    await operation.prepare(system)
+                wanted = operations
                 while True:
-                    late = None
+                    for operation in wanted:
+                        at, failed = operation, operation.text
+                        if operation not in begun:
+                            begun.append(operation)  # Before it is prepared: it may be cancelled in the middle.
+                        await self._prepare(operation, begun)
+                    wanted, self._loose = tuple(self._loose), []
+                    if wanted:
+                        continue
                     for operation in operations:
                         at, failed = operation, operation.text
                         waiting = operation.ready(system)
                         if waiting:
-                            late = operation
+                            wanted = (operation,)
                             break
-                    if late is None:
+                    else:
                         at, failed, waiting = None, "", self._arrangement.ready(system)
                         if not waiting:
                             break
                     await asyncio.sleep(LOOK_AGAIN)
-                    if late is not None:
-                        await late.prepare(system)
             failed, waiting = "commit", ""
             system._homes.journal.barrier()
             self._commit()  # In the same step of the loop in which all were ready.
@@ -169,6 +173,27 @@ class Transaction:
             if isinstance(error, (HoldfastError, TimeoutError)):
                 raise TransactionFailed(failed, cause, undone, kept) from error
             raise
+
+    async def _prepare(self, operation: Operation, begun: list[Operation]) -> None:
+        """Prepare one step. While its actor is between two lives, those at rest for other steps go on."""
+        system = self._system
+        others = [one for one in begun if one.work is not operation.work]
+        if not others:
+            await operation.prepare(system)
+            return
+        work = system._node.loop.create_task(operation.prepare(system), name=operation.text)
+        work.add_done_callback(seen)  # Whoever is cancelled has no use for its error.
+        is_held = True
+        try:
+            while not (await asyncio.wait((work,), timeout=LOOK_AGAIN))[0]:
+                if is_held and operation.is_away(system):
+                    is_held, each = False, list({one.work: one for one in others}.values())
+                    gone_on = await asyncio.gather(*(one.let_go(system) for one in each))
+                    self._loose += [one for one, goes_on in zip(each, gone_on, strict=True) if goes_on]
+        finally:
+            work.cancel()
+            await asyncio.wait((work,))
+        work.result()
 
     def _commit(self) -> None:
         """Put all of it in force, with no wait in between: there is no way back from here."""

@@ -1909,6 +1909,13 @@ CHECKS = {
         WRONG,
         "test_a_verb_of_the_system",
     ),
+    "nobody is held while another one is restarted": Check(
+        "system/transaction/transaction.py",
+        "                if is_held and operation.is_away(system):\n",
+        "                if False:\n",
+        "tests/system/test_held_meanwhile.py",
+        "isolate",
+    ),
 }
 
 test_the_table_is_true, test_without_the_check_a_test_fails = as_tests(CHECKS)
