@@ -477,10 +477,15 @@ class ActorContext:
         task = self._resting(self._perform(effect, failed), "effect", effect.key, None)
         return task
 
-    def _perform(self, effect: EffectCall, failed: Callable[[FailedAttempt], None]) -> Coroutine[Any, Any, object]:
+    def _perform(
+        self,
+        effect: EffectCall,
+        failed: Callable[[FailedAttempt], None],
+        in_thread: Callable[..., Awaitable[Any]] | None = None,
+    ) -> Coroutine[Any, Any, object]:
         """Perform it here and now."""
         node = self._cell.node
-        run = node.threads.run if effect.isolation == "thread" else node.ports.run_in_process
+        run = (in_thread or node.threads.run) if effect.isolation == "thread" else node.ports.run_in_process
         return effect.perform(self.path, run, node.numbers.next_seed(), self._token, failed)
 
     def sleep_until(self, when: float) -> asyncio.Future[None]:

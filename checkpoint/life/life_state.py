@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 from ...actors.effects import EffectCall
 from ..durable_timers import said_by
+from ..turn_word import IDLE, OVER, WAITS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -163,6 +164,7 @@ class LifeWaits:
         outcomes: futures of what comes of outputs, by (turn, output), each with what it has to be.
         moment: until when the handler of the turn in hand has waited, in Unix time.
         resting: how many moments and messages the turn in hand waits for.
+        threads: effects whose functions run in threads of this process, by (turn, output).
         stranded: asks whose receivers have been stopped, and answer in their next lives, by (turn, output).
         heard: how many outcomes the home has told.
         order: tells the turn in hand its outcomes, one after another.
@@ -172,6 +174,7 @@ class LifeWaits:
     outcomes: dict[tuple[int, int], tuple[asyncio.Future[Any], Awaited]] = dataclasses.field(default_factory=dict)
     moment: float = 0.0
     resting: int = 0
+    threads: set[tuple[int, int]] = dataclasses.field(default_factory=set)
     stranded: frozenset[tuple[int, int]] = frozenset()
     heard: int = 0
 
@@ -179,6 +182,15 @@ class LifeWaits:
         """Whether all that the turn in hand waits for at home are answers that do not come before others live again."""
         left = [(place, awaited) for place, (future, awaited) in self.outcomes.items() if not future.done()]
         return bool(left) and all(place in self.stranded or has_nobody(awaited) for place, awaited in left)
+
+    def how(self, turn: int) -> int:
+        """How this turn stands, which waits: only a thread, or what the turn has begun itself, ends a process unseen."""
+        outcomes = self.outcomes.items()
+        if any(of == turn for of, _ in self.threads):
+            return WAITS
+        if not any(of == turn and not future.done() for (of, _), (future, _) in outcomes):
+            return WAITS
+        return OVER if self.resting else WAITS | IDLE
 
     @property
     def is_open(self) -> bool:
@@ -190,10 +202,6 @@ class LifeWaits:
     def may_be_left(self) -> bool:
         """Whether the turn in hand rests, and all that it has let out so far was accepted."""
         return self.resting > 0 and all(kind is not None or future.done() for future, kind in self.outcomes.values())
-
-    def rested(self) -> None:
-        """Something has come that a turn has waited for, perhaps an earlier one."""
-        self.resting = max(0, self.resting - 1)
 
 
 @dataclasses.dataclass(slots=True)

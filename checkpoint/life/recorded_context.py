@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import random
-from collections.abc import Awaitable, Callable, Generator
+import types
+from collections.abc import Awaitable, Callable, Coroutine, Generator
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import msgspec
@@ -37,7 +38,6 @@ from ...actors.seconds import check_seconds
 from ...actors.values import encode_value
 from ...actors.values.saved_refs import SavedHandle
 from ..protocol import REPLY, SINCE_THEN, Answer, EndWanted, Feed, Perform, Performed, PipeDone, Retried
-from ..turn_word import WAITS
 from .glances import seen_beside
 from .life_state import Asked
 from .recorded_inbox import INIT, STARTED, Fed
@@ -188,28 +188,33 @@ class Pending(OutcomeFuture[Any]):
 
 
 class Resting(Pending):
-    """A moment or a message that a turn waits for. When it has come, or is not waited for any more, the turn rests no
-    longer for it, as its handler is about to see. (A callback would be kept as long as the turn waits.)
+    """A moment or a message that a turn waits for: it rests until that has come, or is not waited for any more.
+
+    A callback would be kept as long as the turn waits.
     """
 
     __slots__ = ()
 
+    def __init__(self, life: Life, k: int) -> None:
+        super().__init__(life, k)
+        life.waits.resting += 1
+
     def set_result(self, result: Any) -> None:
-        self._over_soon()
+        self._rests_no_more()
         super().set_result(result)
 
     def set_exception(self, exception: Any) -> None:
-        self._over_soon()
+        self._rests_no_more()
         super().set_exception(exception)
 
     def cancel(self, msg: Any = None) -> bool:
         if not self.done():
-            self._life.waits.rested()  # At once: what the handler does next may leave in this very step.
+            self._rests_no_more()
         return super().cancel(msg)
 
-    def _over_soon(self) -> None:
-        life = self._life
-        life.cell.node.loop.call_soon(life.waits.rested)  # In front of whoever waits for it.
+    def _rests_no_more(self) -> None:
+        if self.place[0] == self._life.turn:
+            self._life.waits.resting -= 1
 
 
 class RecordedContext(ActorContext):
@@ -448,9 +453,7 @@ class RecordedContext(ActorContext):
         self, verb: str, name: str, seconds: float, kinds: tuple[type[Message[Any]], ...], since: str = SINCE_THEN
     ) -> asyncio.Future[Any]:
         """Wait for what the home waits for: nothing of it is out."""
-        outcome = self._awaited(Resting, verb, since, name, seconds, kinds)
-        self.recorded.waits.resting += 1
-        return outcome
+        return self._awaited(Resting, verb, since, name, seconds, kinds)
 
     def _slept(self, seconds: float, *, is_moment: bool) -> asyncio.Future[None]:
         if self._in_turn():
@@ -468,18 +471,47 @@ class RecordedContext(ActorContext):
         if outcome.is_out:
             return  # Whoever led before has been told so, too.
         outcome.is_out, self._token = True, order.token
-        task = self._beside(self._carried_out(order.turn, order.k, effect), "effect")
+        task = self._beside(self._watched(order.turn, order.k, effect), "effect")
         outcome.add_done_callback(lambda _: task.cancel())  # The handler does not wait for it any more.
 
+    async def _watched(self, turn: int, k: int, effect: EffectCall) -> None:
+        await self._stepped(turn, self._carried_out(turn, k, effect))
+
+    @types.coroutine
+    def _stepped(self, turn: int, work: Coroutine[Any, Any, None]) -> Generator[Any, Any, None]:
+        """Step what works for a turn that waits: if a step ends the process, the turn has ended it."""
+        step, value = work.send, None
+        while True:
+            try:
+                with self.recorded.work_beside(turn):
+                    waiting = step(value)
+            except StopIteration:
+                return
+            try:
+                value = yield waiting
+                step = work.send
+            except GeneratorExit:
+                work.close()
+                raise
+            except BaseException as error:
+                step, value = work.throw, error
+
     async def _carried_out(self, turn: int, k: int, effect: EffectCall) -> None:
-        life = self.recorded
+        life, place = self.recorded, (turn, k)
+
+        async def in_thread(function: Callable[..., T], *args: Any) -> T:
+            life.waits.threads.add(place)
+            try:
+                return await self._cell.node.threads.run(function, *args)
+            finally:
+                life.waits.threads.discard(place)
 
         def failed(attempt: FailedAttempt) -> None:
             if not self._closed and (turn, k) in life.waits.outcomes:
                 life.port.to_home(Retried(turn, k, attempt))
 
         try:
-            value = await self._perform(effect, failed)
+            value = await self._perform(effect, failed, in_thread)
             answer = Answer(REPLY, "", encode_value(value, where=f"the result of {effect.key}"))
         except Exception as error:
             answer = self._kept(effect, error)
@@ -559,14 +591,14 @@ class RecordedContext(ActorContext):
 
     def _turn_waits(self) -> None:
         life = self.recorded
-        life.mark(WAITS)
+        life.mark(waits=True)
         if life.stage.begun >= 0:
             life.say_it_waits()
         if life.stage.stopping is not None:
             self._cell.node.loop.call_soon(life.leave_waiting)  # It has had something else to wait for.
 
     def _turn_goes_on(self) -> None:
-        self.recorded.mark()
+        self.recorded.mark(waits=False)
 
     def _leaves_turn(self) -> bool:
         more = self._cell.more
