@@ -18,7 +18,7 @@ OVER: Final = 1 << 62
 BACK: Final = 1 << 61
 """Set once an input has begun behind a later one: then the number says nothing about the others."""
 IDLE: Final = 1 << 60
-"""Set beside `WAITS` if nothing that the turn waits for is done by this process unseen: no thread, no task of its own."""
+"""Set beside `WAITS` if the process does nothing unseen for the turn: no thread works for it, nor a task of its own."""
 
 
 class TurnWord:

@@ -184,7 +184,7 @@ class LifeWaits:
         return bool(left) and all(place in self.stranded or has_nobody(awaited) for place, awaited in left)
 
     def how(self, turn: int) -> int:
-        """How this turn stands, which waits: only a thread, or what the turn has begun itself, ends a process unseen."""
+        """How this turn stands, which waits: a thread, or what it has begun itself, may end the process unseen."""
         outcomes = self.outcomes.items()
         if any(of == turn for of, _ in self.threads):
             return WAITS

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import functools
 import hashlib
 import random
 import types
-from collections.abc import Awaitable, Callable, Coroutine, Generator
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Generator
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import msgspec
@@ -471,11 +473,11 @@ class RecordedContext(ActorContext):
         if outcome.is_out:
             return  # Whoever led before has been told so, too.
         outcome.is_out, self._token = True, order.token
-        task = self._beside(self._watched(order.turn, order.k, effect), "effect")
+        task = self._beside(self._watched(order, effect), "effect")
         outcome.add_done_callback(lambda _: task.cancel())  # The handler does not wait for it any more.
 
-    async def _watched(self, turn: int, k: int, effect: EffectCall) -> None:
-        await self._stepped(turn, self._carried_out(turn, k, effect))
+    async def _watched(self, order: Perform, effect: EffectCall) -> None:
+        await self._stepped(order.turn, self._carried_out(order.turn, order.k, effect, alone=order.alone))
 
     @types.coroutine
     def _stepped(self, turn: int, work: Coroutine[Any, Any, None]) -> Generator[Any, Any, None]:
@@ -496,22 +498,28 @@ class RecordedContext(ActorContext):
             except BaseException as error:
                 step, value = work.throw, error
 
-    async def _carried_out(self, turn: int, k: int, effect: EffectCall) -> None:
-        life, place = self.recorded, (turn, k)
-
-        async def in_thread(function: Callable[..., T], *args: Any) -> T:
-            life.waits.threads.add(place)
+    @contextlib.asynccontextmanager
+    async def _in_thread(self, place: tuple[int, int], *, alone: bool) -> AsyncIterator[None]:
+        """Around an attempt in a thread, which may end the process unseen; `alone`: one such attempt at a time."""
+        waits = self.recorded.waits
+        async with self._cell.node.threads.alone if alone else contextlib.nullcontext():
+            waits.threads.add(place)
             try:
-                return await self._cell.node.threads.run(function, *args)
+                yield
             finally:
-                life.waits.threads.discard(place)
+                waits.threads.discard(place)
+
+    async def _carried_out(self, turn: int, k: int, effect: EffectCall, *, alone: bool) -> None:
+        life, attempt = self.recorded, contextlib.nullcontext
+        if not effect.is_async and effect.isolation == "thread":
+            attempt = functools.partial(self._in_thread, (turn, k), alone=alone)
 
         def failed(attempt: FailedAttempt) -> None:
             if not self._closed and (turn, k) in life.waits.outcomes:
                 life.port.to_home(Retried(turn, k, attempt))
 
         try:
-            value = await self._perform(effect, failed, in_thread)
+            value = await self._perform(effect, failed, attempt)
             answer = Answer(REPLY, "", encode_value(value, where=f"the result of {effect.key}"))
         except Exception as error:
             answer = self._kept(effect, error)
