@@ -23,8 +23,10 @@ from .seconds import check_seconds
 class Retry:
     """Say how often an effect is attempted, and how long it waits between two attempts.
 
+    Attempts are not journaled: the next life of the actor, which has no outcome of the effect yet, counts them from 1.
+
     Attributes:
-        attempts: how often at most, >= 1.
+        attempts: how often at most in one life, >= 1.
         backoff: how long it waits before each further attempt.
         on: classes of errors after which it is attempted again. After any other error it has failed.
 

@@ -510,7 +510,8 @@ class RecordedContext(ActorContext):
                 waits.threads.discard(place)
 
     async def _carried_out(self, turn: int, k: int, effect: EffectCall, *, alone: bool) -> None:
-        life, attempt = self.recorded, contextlib.nullcontext
+        life = self.recorded
+        attempt: Callable[[], contextlib.AbstractAsyncContextManager[None]] = contextlib.nullcontext
         if not effect.is_async and effect.isolation == "thread":
             attempt = functools.partial(self._in_thread, (turn, k), alone=alone)
 

@@ -37,6 +37,11 @@ def kill() -> int:
     return 1
 
 
+def block_and_kill() -> int:
+    time.sleep(0.05)  # Long enough for the loop to have nothing to do.
+    return kill()
+
+
 async def kill_later() -> int:
     await asyncio.sleep(0.01)
     return kill()
@@ -73,9 +78,11 @@ class Worker(hf.Actor):
         if message.then == "fatal async":
             await self.ctx.effect(kill_later)
         elif message.then == "fatal thread":
-            await self.ctx.effect(kill)
+            await self.ctx.effect(block_and_kill)
         elif message.then == "fatal race":
-            await asyncio.wait([self.ctx.effect(kill), self.ctx.wait_for(Cancel)], return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait(
+                [self.ctx.effect(block_and_kill), self.ctx.wait_for(Cancel)], return_when=asyncio.FIRST_COMPLETED
+            )
         elif message.then == "fatal code":
             kill()
         else:
