@@ -26,7 +26,11 @@ FIRST, KILLS = (
 )
 SOME = [("sleep", "fatal async"), ("wait", "fatal thread"), ("ask", "fatal race")]
 PATIENT = [("", "async"), ("sleep", "ask"), ("", "retried"), ("async", "wait"), ("until", "sleep")]
-MORE_PATIENT = [(first, then) for first in FIRST for then in ("async", "process", "ask", "wait", "sleep", "retried")]
+MORE_PATIENT = [
+    *itertools.product(FIRST, ("async", "ask", "wait", "sleep", "retried")),
+    ("", "process"),
+    ("sleep", "process"),
+]
 
 
 def live(store: Path, steps: list[str]) -> tuple[bool, list[list[object]]]:
@@ -55,3 +59,9 @@ def test_of_several_turns_with_threads_the_one_that_kills_is_put_aside(tmp_path:
     steps = ["slow::slow", "slow::slow", "guilty::fatal thread"]
     lives = [live(tmp_path / "app.db", steps) for _ in range(3)]
     assert lives == [(False, []), (False, []), (True, [["/app/guilty2", 2]])]
+
+
+def test_who_was_at_work_once_and_is_not_started_any_more_does_not_hide_others(tmp_path: Path) -> None:
+    store, steps = tmp_path / "app.db", ["innocent::sleep", "guilty::fatal thread"]
+    assert live(store, ["guilty::fatal code"]) == (False, [])
+    assert [live(store, steps) for _ in range(3)] == [(False, []), (False, []), (True, [["/app/guilty1", 2]])]

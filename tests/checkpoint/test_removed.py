@@ -386,6 +386,13 @@ CHECKS = {
         KILLING,
         "what_waits_is_not",
     ),
+    "who was at work at one death of the root is not at work at the next one": Check(
+        "checkpoint/sqlite/in_hand.py",
+        "self._at(place)[1] = word | WAITS",
+        "pass",
+        KILLING,
+        "at_work_once",
+    ),
     "threads that may have ended the root run one at a time": Check(
         "checkpoint/life/recorded_context.py",
         "self._cell.node.threads.alone if alone else",
