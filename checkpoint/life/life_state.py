@@ -185,12 +185,10 @@ class LifeWaits:
 
     def how(self, turn: int) -> int:
         """How this turn stands, which waits: a thread, or what it has begun itself, may end the process unseen."""
-        outcomes = self.outcomes.items()
-        if any(of == turn for of, _ in self.threads):
+        out = [kind for (of, _), (future, kind) in self.outcomes.items() if of == turn and not future.done()]
+        if not out or any(of == turn for of, _ in self.threads):
             return WAITS
-        if not any(of == turn and not future.done() for (of, _), (future, _) in outcomes):
-            return WAITS
-        return OVER if self.resting else WAITS | IDLE
+        return OVER if any(type(kind) is tuple for kind in out) else WAITS | IDLE  # What rests for days ends nothing.
 
     @property
     def is_open(self) -> bool:
@@ -202,6 +200,10 @@ class LifeWaits:
     def may_be_left(self) -> bool:
         """Whether the turn in hand rests, and all that it has let out so far was accepted."""
         return self.resting > 0 and all(kind is not None or future.done() for future, kind in self.outcomes.values())
+
+    def rested(self) -> None:
+        """Something has come that a turn has waited for, perhaps an earlier one."""
+        self.resting = max(0, self.resting - 1)
 
 
 @dataclasses.dataclass(slots=True)

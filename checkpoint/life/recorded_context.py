@@ -190,33 +190,28 @@ class Pending(OutcomeFuture[Any]):
 
 
 class Resting(Pending):
-    """A moment or a message that a turn waits for: it rests until that has come, or is not waited for any more.
-
-    A callback would be kept as long as the turn waits.
+    """A moment or a message that a turn waits for. When it has come, or is not waited for any more, the turn rests no
+    longer for it, as its handler is about to see. (A callback would be kept as long as the turn waits.)
     """
 
     __slots__ = ()
 
-    def __init__(self, life: Life, k: int) -> None:
-        super().__init__(life, k)
-        life.waits.resting += 1
-
     def set_result(self, result: Any) -> None:
-        self._rests_no_more()
+        self._over_soon()
         super().set_result(result)
 
     def set_exception(self, exception: Any) -> None:
-        self._rests_no_more()
+        self._over_soon()
         super().set_exception(exception)
 
     def cancel(self, msg: Any = None) -> bool:
         if not self.done():
-            self._rests_no_more()
+            self._life.waits.rested()  # At once: what the handler does next may leave in this very step.
         return super().cancel(msg)
 
-    def _rests_no_more(self) -> None:
-        if self.place[0] == self._life.turn:
-            self._life.waits.resting -= 1
+    def _over_soon(self) -> None:
+        life = self._life
+        life.cell.node.loop.call_soon(life.waits.rested)  # In front of whoever waits for it.
 
 
 class RecordedContext(ActorContext):
@@ -455,7 +450,9 @@ class RecordedContext(ActorContext):
         self, verb: str, name: str, seconds: float, kinds: tuple[type[Message[Any]], ...], since: str = SINCE_THEN
     ) -> asyncio.Future[Any]:
         """Wait for what the home waits for: nothing of it is out."""
-        return self._awaited(Resting, verb, since, name, seconds, kinds)
+        outcome = self._awaited(Resting, verb, since, name, seconds, kinds)
+        self.recorded.waits.resting += 1
+        return outcome
 
     def _slept(self, seconds: float, *, is_moment: bool) -> asyncio.Future[None]:
         if self._in_turn():

@@ -367,8 +367,8 @@ CHECKS = {
     ),
     "who waits for an answer or an effect does not end the root": Check(
         "checkpoint/life/life_state.py",
-        "return OVER if self.resting else WAITS | IDLE",
-        "return OVER if self.resting else WAITS",
+        "for kind in out) else WAITS | IDLE",
+        "for kind in out) else WAITS",
         KILLING,
         "what_waits_is_not",
     ),
