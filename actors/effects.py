@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import dataclasses
 import functools
 import random
 from collections.abc import Awaitable, Callable
+from contextlib import AbstractAsyncContextManager
 from contextvars import ContextVar
 from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
@@ -21,8 +23,10 @@ from .seconds import check_seconds
 class Retry:
     """Say how often an effect is attempted, and how long it waits between two attempts.
 
+    Attempts are not journaled: the next life of the actor, which has no outcome of the effect yet, counts them from 1.
+
     Attributes:
-        attempts: how often at most, >= 1.
+        attempts: how often at most in one life, >= 1.
         backoff: how long it waits before each further attempt.
         on: classes of errors after which it is attempted again. After any other error it has failed.
 
@@ -140,6 +144,7 @@ class EffectCall(msgspec.Struct, frozen=True, eq=False):
         seed: int,
         token: int,
         failed: Callable[[FailedAttempt], None],
+        around: Callable[[], AbstractAsyncContextManager[None]],
     ) -> object:
         """Attempt it until it succeeds or has failed, and return what it returns. It is awaited in a task of its own.
 
@@ -149,6 +154,7 @@ class EffectCall(msgspec.Struct, frozen=True, eq=False):
             seed: of the jitter of the back-off.
             token: the fencing token of the life that performs it.
             failed: is told of each attempt that is followed by another one.
+            around: makes what is entered before each attempt, and is left behind it; its time limit begins inside.
 
         Raises:
             EffectFailed: the last attempt has raised, or has taken too long, or its process has ended.
@@ -162,11 +168,8 @@ class EffectCall(msgspec.Struct, frozen=True, eq=False):
             attempt += 1
             limit = None if self.timeout is None else asyncio.timeout(self.timeout)
             try:
-                work = self.function(*self.args) if self.is_async else run(self.function, *self.args)
-                if limit is None:
-                    return await work
-                async with limit:
-                    return await work
+                async with around(), limit or contextlib.nullcontext():
+                    return await (self.function(*self.args) if self.is_async else run(self.function, *self.args))
             except HoldfastError:
                 raise
             except BaseException as error:  # Whatever a function can raise; it ends neither the program nor its actor.

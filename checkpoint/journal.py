@@ -303,9 +303,9 @@ class InHand(Protocol):
     """Which inputs are in hand, as it outlives the process: what an engine may have as its attribute `in_hand`."""
 
     def begun(self, address: str) -> int:
-        """The input at an address in whose turn the last owner of the store was killed; -1: none.
+        """The input at an address in whose turn the last owner of the store was killed; -1: none. It is said once.
 
-        A turn that waits is not meant if another was at work.
+        A turn that waits is not meant if another was at work, or if nothing works for it unseen.
         """
         ...
 

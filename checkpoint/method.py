@@ -265,7 +265,7 @@ def hybrid(
             meanwhile: at 1.0 or below, an actor that gets more than it can handle never catches up.
         max_deliveries: deaths and kills in the turn of one message, in a row and without progress, after which it is
             quarantined. A new outcome of an ask, an effect or a long wait is progress; an end that a supervisor has
-            ordered does not count.
+            ordered does not count, nor does the death of a process while the turn merely waits.
         journal_limit: bytes of messages kept since the last snapshot; when it is reached, sends wait or are refused.
         keep: snapshots that are kept in a store that lasts, newest first; 1 saves the memory or disk of the older one.
             In memory two are kept at most.

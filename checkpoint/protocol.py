@@ -199,12 +199,14 @@ class Outcome(msgspec.Struct, array_like=True, tag=2):
 class Perform(msgspec.Struct, array_like=True, tag=22):
     """The effect that was output (turn, k) has no outcome, and all that precedes it is safe: perform it.
 
-    `token` is the fencing token of whoever is ordered to.
+    `token` is the fencing token of whoever is ordered to; `alone`: its process has died in this turn again and again,
+    perhaps of another one's thread.
     """
 
     turn: int
     k: int
     token: int
+    alone: bool = False
 
 
 class Go(msgspec.Struct, array_like=True, tag=3):

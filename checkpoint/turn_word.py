@@ -2,12 +2,14 @@
 
 A process has one thread for its turns, so that of all turns in hand at most one is at work, and the others wait for
 something. If the process dies while one is, it is that one which has ended it, as far as anybody can know. A turn is
-not at work while a thread, a task or a process of its own works for it.
+at work while its async effects are stepped, too; not while a thread, a task or a process of its own works for it.
 """
 
 from __future__ import annotations
 
 from typing import Final
+
+from ..actors.exit_reasons import ExitReason, OutOfMemory
 
 WAITS: Final = 1 << 63
 """Set while the turn waits for something; below the flags stands 1 + the number of the input, or 0: there was none."""
@@ -15,6 +17,8 @@ OVER: Final = 1 << 62
 """Set when that turn counts for nothing that ends the process: it is over, or rests for days."""
 BACK: Final = 1 << 61
 """Set once an input has begun behind a later one: then the number says nothing about the others."""
+IDLE: Final = 1 << 60
+"""Set beside `WAITS` if the process does nothing unseen for the turn: no thread works for it, nor a task of its own."""
 
 
 class TurnWord:
@@ -49,16 +53,16 @@ class TurnWord:
     @property
     def how(self) -> int:
         """How the last turn stands."""
-        return int(self._words[0]) & (WAITS | OVER)
+        return int(self._words[0]) & (WAITS | OVER | IDLE)
 
 
 def input_of(word: int) -> int:
     """The input in hand; -1: none.
 
-    >>> [input_of(word) for word in (0, 8, 8 | WAITS, 8 | BACK, 8 | OVER)]
-    [-1, 7, 7, 7, -1]
+    >>> [input_of(word) for word in (0, 8, 8 | WAITS, 8 | WAITS | IDLE, 8 | BACK, 8 | OVER)]
+    [-1, 7, 7, 7, 7, -1]
     """
-    return -1 if word & OVER else (word & (BACK - 1)) - 1
+    return -1 if word & OVER else (word & (IDLE - 1)) - 1
 
 
 def may_have_begun(word: int, key: int) -> bool:
@@ -67,7 +71,7 @@ def may_have_begun(word: int, key: int) -> bool:
     >>> [may_have_begun(word, 7) for word in (0, 7, 8, 8 | OVER, 9 | OVER, 7 | OVER, 7 | BACK)]
     [False, False, True, True, True, False, True]
     """
-    return bool(word & BACK) or key < word & (BACK - 1)
+    return bool(word & BACK) or key < word & (IDLE - 1)
 
 
 def is_at_work(word: int) -> bool:
@@ -84,5 +88,14 @@ def blamed(word: int, *, one_works: bool) -> int:
 
     >>> blamed(8, one_works=True), blamed(8 | WAITS, one_works=True), blamed(8 | WAITS, one_works=False)
     (7, -1, 7)
+    >>> blamed(8 | WAITS | IDLE, one_works=False)
+    -1
     """
-    return -1 if word >= WAITS and one_works else input_of(word)
+    return -1 if word & WAITS and (one_works or word & IDLE) else input_of(word)
+
+
+def is_innocent(word: int, reason: ExitReason, *, one_works: bool) -> bool:
+    """Whether the end of the process counts for nothing against the turn; its memory belongs to all turns in hand."""
+    if isinstance(reason, OutOfMemory):
+        return False
+    return reason.blames_nobody or blamed(word, one_works=one_works) < 0

@@ -66,6 +66,7 @@ class HandlerThreads(concurrent.futures.Executor):
         self._work: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._idle = threading.Semaphore(0)
         self._count = 0
+        self.alone = asyncio.Lock()  # held by one that is not to run beside others of its kind
 
     def run(self, function: Callable[..., T], *args: Any) -> asyncio.Future[T]:
         """Run a function in a thread, with the caller's context variables. Cancelling leaves a begun one behind."""

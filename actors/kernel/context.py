@@ -10,6 +10,7 @@ import types
 import uuid
 from collections import deque
 from collections.abc import Awaitable, Callable, Coroutine, Iterator
+from contextlib import AbstractAsyncContextManager, nullcontext
 from contextvars import ContextVar, copy_context
 from types import CodeType, FrameType
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, TypeVar, TypeVarTuple, cast, overload
@@ -480,11 +481,16 @@ class ActorContext:
         task = self._resting(self._perform(effect, failed), "effect", effect.key, None)
         return task
 
-    def _perform(self, effect: EffectCall, failed: Callable[[FailedAttempt], None]) -> Coroutine[Any, Any, object]:
-        """Perform it here and now."""
+    def _perform(
+        self,
+        effect: EffectCall,
+        failed: Callable[[FailedAttempt], None],
+        attempt: Callable[[], AbstractAsyncContextManager[None]] = nullcontext,
+    ) -> Coroutine[Any, Any, object]:
+        """Perform it here and now, each attempt in an `attempt`."""
         node = self._cell.node
         run = node.threads.run if effect.isolation == "thread" else node.ports.run_in_process
-        return effect.perform(self.path, run, node.numbers.next_seed(), self._token, failed)
+        return effect.perform(self.path, run, node.numbers.next_seed(), self._token, failed, attempt)
 
     def sleep_until(self, when: float) -> asyncio.Future[None]:
         """Have the turn in hand wait until a moment, be it days away.

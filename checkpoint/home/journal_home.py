@@ -23,7 +23,7 @@ from ...actors.persistence import UNFIT, is_in_vain
 from ..method import Method
 from ..recovery.recoveries import Recovery
 from ..snapshot.unreplayed import forget_turns
-from ..turn_word import input_of, may_have_begun
+from ..turn_word import input_of, is_innocent, may_have_begun
 from .admission import withdraw
 from .disposal import drop_all
 from .held_messages import (
@@ -368,7 +368,8 @@ class JournalHome(RecordedHome):
         """Keep everything, and count deaths in the same turn."""
         if worker is None or cell.state is not RUNNING:
             return None
-        running, noticed, ordered = self.in_hand(worker), worker.end.noticed_at, reason.blames_nobody
+        running, noticed = self.in_hand(worker), worker.end.noticed_at
+        ordered = is_innocent(worker.page[0], reason, one_works=False)
 
         def over(recovers: bool | None) -> None:
             self.over(

@@ -56,6 +56,8 @@ ACCEPTED = Came(REPLY, "", msgspec.msgpack.encode(None))
 
 SHORT = 0.05
 """Seconds that asks which change nothing wait for an effect: one that is out for longer keeps them waiting no more."""
+SUSPECT = 2
+"""Deaths in a row in its turn after which the threads of a message's effects run one at a time."""
 FORGOTTEN = "the life that has promised the reply has ended, and the handle was in nothing that the next one has"
 MARK = "ask "
 """How the origin of an input begins that somebody's recorded turn has asked; the asker is its sender."""
@@ -389,10 +391,15 @@ class PendingCalls:
         elif self.effects[place].failed:
             self.effects[place] = TurnRest("effect", out.to, self.effects[place].since, is_again=is_again)
         if self._home.life.port is not None:
-            self._home.life.port.to_life(Perform(turn, out.k, self._home.life.token))
+            self._home.life.port.to_life(Perform(turn, out.k, self._home.life.token, self._is_suspect()))
         self.long.discard(place)
         if self._look is None:
             self._look = self._home.node.loop.call_later(SHORT, self._look_whether_long, place)
+
+    def _is_suspect(self) -> bool:
+        """Whether deaths in the turn of the message in hand may be another one's: the next is to show whose."""
+        source = self._home.ledger.open.get(self._home.ledger.begun)
+        return source is not None and source.deliveries >= max(1, min(SUSPECT, self._home.method.max_deliveries - 1))
 
     def _look_whether_long(self, place: tuple[int, int]) -> None:
         """See whether an effect has been out for so long that asks which change nothing are answered beside it."""

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 from ...actors.effects import EffectCall
 from ..durable_timers import said_by
+from ..turn_word import IDLE, OVER, WAITS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -163,6 +164,7 @@ class LifeWaits:
         outcomes: futures of what comes of outputs, by (turn, output), each with what it has to be.
         moment: until when the handler of the turn in hand has waited, in Unix time.
         resting: moments and messages that the turn in hand waits for, and that have not come.
+        threads: effects whose functions run in threads of this process, by (turn, output).
         stranded: asks whose receivers have been stopped, and answer in their next lives, by (turn, output).
         heard: how many outcomes the home has told.
         order: tells the turn in hand its outcomes, one after another.
@@ -172,6 +174,7 @@ class LifeWaits:
     outcomes: dict[tuple[int, int], tuple[asyncio.Future[Any], Awaited]] = dataclasses.field(default_factory=dict)
     moment: float = 0.0
     resting: tuple[asyncio.Future[Any], ...] = ()
+    threads: set[tuple[int, int]] = dataclasses.field(default_factory=set)
     stranded: frozenset[tuple[int, int]] = frozenset()
     heard: int = 0
 
@@ -179,6 +182,13 @@ class LifeWaits:
         """Whether all that the turn in hand waits for at home are answers that do not come before others live again."""
         left = [(place, awaited) for place, (future, awaited) in self.outcomes.items() if not future.done()]
         return bool(left) and all(place in self.stranded or has_nobody(awaited) for place, awaited in left)
+
+    def how(self, turn: int) -> int:
+        """How this turn stands, which waits: a thread, or what it has begun itself, may end the process unseen."""
+        out = [kind for (of, _), (future, kind) in self.outcomes.items() if of == turn and not future.done()]
+        if not out or any(of == turn for of, _ in self.threads):
+            return WAITS
+        return OVER if any(type(kind) is tuple for kind in out) else WAITS | IDLE  # What rests for days ends nothing.
 
     @property
     def is_open(self) -> bool:

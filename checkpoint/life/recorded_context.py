@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import functools
 import hashlib
-from collections.abc import Awaitable, Callable, Generator
+import types
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Generator
 from random import Random
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
@@ -39,7 +42,6 @@ from ...actors.values import encode_value
 from ...actors.values.path_parts import check_topic
 from ...actors.values.saved_refs import SavedHandle
 from ..protocol import REPLY, SINCE_THEN, Answer, EndWanted, Feed, Perform, Performed, PipeDone, Retried
-from ..turn_word import WAITS
 from .glances import seen_beside
 from .life_state import Asked
 from .recorded_inbox import INIT, STARTED, Fed
@@ -490,18 +492,54 @@ class RecordedContext(ActorContext):
         if outcome.is_out:
             return  # Whoever led before has been told so, too.
         outcome.is_out, self._token = True, order.token
-        task = self._beside(self._carried_out(order.turn, order.k, effect), "effect")
+        task = self._beside(self._watched(order, effect), "effect")
         outcome.add_done_callback(lambda _: task.cancel())  # The handler does not wait for it any more.
 
-    async def _carried_out(self, turn: int, k: int, effect: EffectCall) -> None:
+    async def _watched(self, order: Perform, effect: EffectCall) -> None:
+        await self._stepped(order.turn, self._carried_out(order.turn, order.k, effect, alone=order.alone))
+
+    @types.coroutine
+    def _stepped(self, turn: int, work: Coroutine[Any, Any, None]) -> Generator[Any, Any, None]:
+        """Step what works for a turn that waits: if a step ends the process, the turn has ended it."""
+        step, value = work.send, None
+        while True:
+            try:
+                with self.recorded.work_beside(turn):
+                    waiting = step(value)
+            except StopIteration:
+                return
+            try:
+                value = yield waiting
+                step = work.send
+            except GeneratorExit:
+                work.close()
+                raise
+            except BaseException as error:
+                step, value = work.throw, error
+
+    @contextlib.asynccontextmanager
+    async def _in_thread(self, place: tuple[int, int], *, alone: bool) -> AsyncIterator[None]:
+        """Around an attempt in a thread, which may end the process unseen; `alone`: one such attempt at a time."""
+        waits = self.recorded.waits
+        async with self._cell.node.threads.alone if alone else contextlib.nullcontext():
+            waits.threads.add(place)
+            try:
+                yield
+            finally:
+                waits.threads.discard(place)
+
+    async def _carried_out(self, turn: int, k: int, effect: EffectCall, *, alone: bool) -> None:
         life = self.recorded
+        attempt: Callable[[], contextlib.AbstractAsyncContextManager[None]] = contextlib.nullcontext
+        if not effect.is_async and effect.isolation == "thread":
+            attempt = functools.partial(self._in_thread, (turn, k), alone=alone)
 
         def failed(attempt: FailedAttempt) -> None:
             if not self._closed and (turn, k) in life.waits.outcomes:
                 life.port.to_home(Retried(turn, k, attempt))
 
         try:
-            value = await self._perform(effect, failed)
+            value = await self._perform(effect, failed, attempt)
             answer = Answer(REPLY, "", encode_value(value, where=f"the result of {effect.key}"))
         except Exception as error:
             answer = self._kept(effect, error)
@@ -585,14 +623,14 @@ class RecordedContext(ActorContext):
 
     def _turn_waits(self) -> None:
         life = self.recorded
-        life.mark(WAITS)
+        life.mark(waits=True)
         if life.stage.begun >= 0:
             life.say_it_waits()
         if life.stage.stopping is not None:
             self._cell.node.loop.call_soon(life.leave_waiting)  # It has had something else to wait for.
 
     def _turn_goes_on(self) -> None:
-        self.recorded.mark()
+        self.recorded.mark(waits=False)
 
     def _leaves_turn(self) -> bool:
         more = self._cell.more

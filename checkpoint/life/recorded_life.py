@@ -6,10 +6,11 @@ already. Only time and randomness come from the input instead of the world.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, Final, NoReturn, Protocol
 
 from ...actors.control.trace_tail import follow
@@ -355,10 +356,22 @@ class Life:
         for key in (*feed.spent, feed.origin) if feed.kind == TICK else feed.spent:
             self.timers.came(key)
 
-    def mark(self, how: int = 0) -> None:
-        """Say on the page that the turn in hand is at work, or (WAITS) that it waits."""
+    def mark(self, *, waits: bool) -> None:
+        """Say on the page that the turn in hand is at work, or how it waits."""
         if self.word is not None and self.feed is not None:  # Else it is over, or its life was abandoned.
-            self.word.mark(OVER if how and self.waits.resting else how)  # What rests for days ends no process.
+            self.word.mark(self.waits.how(self.turn) if waits else 0)
+
+    @contextlib.contextmanager
+    def work_beside(self, turn: int) -> Iterator[None]:
+        """What is done in here is work for this turn, while it waits."""
+        waits = self.word is not None and self.feed is not None and turn == self.turn and self.word.how != 0
+        if waits:
+            self.mark(waits=False)
+        try:
+            yield
+        finally:
+            if waits and self.word is not None:
+                self.word.mark(OVER if self.feed is None else self.waits.how(self.turn))
 
     def say_it_waits(self) -> None:
         """Say that the turn which had begun in an earlier life does not get on by itself, or does not begin."""

@@ -31,7 +31,7 @@ from ..home.journal_home import Entered, JournalHome
 from ..home.life_ports import RemoteLife
 from ..method import hybrid
 from ..protocol import AtRoot, Begin, Closed, Over, Respec, Started, ToHome, Wanted
-from ..turn_word import blamed, input_of, may_have_begun
+from ..turn_word import input_of, is_innocent, may_have_begun
 
 STOPPED_STARTING = "it was stopped while it started"
 
@@ -203,7 +203,7 @@ class FarParent(Parent):
             self._end_unwanted(reason, recovers=True)
         else:
             running = self.below.place.running(self.cell)
-            is_blameless = reason.blames_nobody or blamed(worker.page[self.slot], one_works=one_works) < 0
+            is_blameless = is_innocent(worker.page[self.slot], reason, one_works=one_works)
             self._over_below(reason, running, ordered=is_blameless, noticed=worker.end.noticed_at)
 
     # -- the end of a life ------------------------------------------------------------------------------------------

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ...actors.exit_reasons import ExitReason, OutOfMemory
+from ...actors.exit_reasons import ExitReason
 from ...actors.kernel import lifecycle
 from ...actors.kernel.address_host import AddressHost
 from ...actors.kernel.cell import Cell
@@ -84,8 +84,7 @@ class SubtreePlace(WorkerPlace):
     def died(self, cell: Cell, reason: ExitReason) -> None:
         worker = self.workers.of(cell)
         if worker is not None:
-            is_of_one = not isinstance(reason, OutOfMemory)  # Its memory belongs to all of them.
-            one_works = is_of_one and self._slots is not None and self._slots.is_any_at_work(worker.page)
+            one_works = self._slots is not None and self._slots.is_any_at_work(worker.page)
             for parent in self._below.values():
                 parent.lost(worker, reason, one_works=one_works)
         super().died(cell, reason)

@@ -2,7 +2,8 @@
 
 It is mapped into memory: to say that a turn begins or ends is no system call, and a kill of the process loses nothing.
 After one, whoever opens the store next knows in whose turns it died, and counts that against those inputs: against the
-one that was at work; if none was, against all that waited. A power loss may lose it: then nothing is counted.
+one that was at work; if none was, against those for which a thread or a task of their own may have ended it. A power
+loss may lose it: then nothing is counted.
 
 The file has the identity of the store, then for each actor a digest of its address and a word (`turn_word.py`).
 """
@@ -15,7 +16,7 @@ import os
 from hashlib import blake2b
 from typing import Final
 
-from ..turn_word import blamed, is_at_work
+from ..turn_word import WAITS, blamed, is_at_work
 from .snapshot_files import refuse_shared
 
 _PAGE: Final = mmap.PAGESIZE
@@ -30,6 +31,7 @@ class InputsInHand:
         self._fd = -1
         self._pages: list[tuple[mmap.mmap, memoryview]] = []
         self._places: dict[int, int] = {}
+        self._left: dict[int, int] = {}  # the words of the last owner
         self._one_worked = False
         self._digest_key = b""
 
@@ -51,12 +53,14 @@ class InputsInHand:
             digest, word = self._at(place)
             if digest:
                 self._places[digest] = place
-                self._one_worked = self._one_worked or is_at_work(word)
+                self._left[digest] = word
+                if is_at_work(word):
+                    self._one_worked = True
+                    self._at(place)[1] = word | WAITS  # At the next death another one was, if this does not live again.
 
     def begun(self, address: str) -> int:
-        """The input in whose turn the last owner was killed, as far as the words say; -1: none."""
-        place = self._places.get(self._digest(address))
-        return -1 if place is None else blamed(self._at(place)[1], one_works=self._one_worked)
+        """The input in whose turn the last owner was killed, as far as the words say; -1: none. It is said once."""
+        return blamed(self._left.pop(self._digest(address), 0), one_works=self._one_worked)
 
     def word(self, address: str) -> memoryview:
         """The word of an actor, to be set as `word[0]`."""

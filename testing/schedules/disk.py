@@ -20,7 +20,7 @@ from ...checkpoint.engine_calls import Called
 from ...checkpoint.group_commit import Commits
 from ...checkpoint.journal import DamagedStore, Entry, Saved, StaleEpoch, StoreFailed
 from ...checkpoint.snapshot.shared_blocks import Segment
-from ...checkpoint.turn_word import blamed, is_at_work
+from ...checkpoint.turn_word import WAITS, blamed, is_at_work
 from ...cluster.store_contents import Change, MemoryContents
 from ..latencies import What
 from .choices import LOSS, Choices
@@ -105,11 +105,14 @@ class Hands:
     def __init__(self, words: dict[str, array[int]]) -> None:
         one_worked = any(is_at_work(word[0]) for word in words.values())
         self._begun = {address: blamed(word[0], one_works=one_worked) for address, word in words.items()}
+        for word in words.values():
+            if is_at_work(word[0]):
+                word[0] |= WAITS  # At the next death another one was, if this does not live again.
         self._words = words
 
     def begun(self, address: str) -> int:
         """See `InHand`."""
-        return self._begun.get(address, -1)
+        return self._begun.pop(address, -1)
 
     def word(self, address: str) -> memoryview:
         """The word of an address."""

@@ -20,6 +20,7 @@ RACE_PROGRAMS = "tests/effects/test_race_programs.py"
 CHANGES = "tests/effects/test_changes_of_races.py"
 TIMERS = "tests/effects/test_timers_while_resting.py"
 IN_HAND = "tests/checkpoint/test_diverging_in_hand.py"
+KILLING = "tests/checkpoint/test_killing_steps.py"
 
 SMALL_DISK = "tests/checkpoint/sqlite/test_small_disk.py"
 CLOCKS_SET = "tests/effects/test_clocks_set.py"
@@ -363,6 +364,41 @@ CHECKS = {
         "self.waits.are_stranded(self._has_nobody)",
         "tests/effects/test_long_waits.py",
         "before_the_turn_rests and call-effect",
+    ),
+    "who waits for an answer or an effect does not end the root": Check(
+        "checkpoint/life/life_state.py",
+        "for kind in out) else WAITS | IDLE",
+        "for kind in out) else WAITS",
+        KILLING,
+        "what_waits_is_not",
+    ),
+    "a step of an async effect is work of its turn": Check(
+        "checkpoint/life/recorded_context.py",
+        "with self.recorded.work_beside(turn):",
+        "with contextlib.nullcontext():",
+        KILLING,
+        "what_waits_is_not",
+    ),
+    "a thread of an effect may end the root, whatever its turn waits for": Check(
+        "checkpoint/life/recorded_context.py",
+        "            waits.threads.add(place)",
+        "            pass",
+        KILLING,
+        "what_waits_is_not",
+    ),
+    "who was at work at one death of the root is not at work at the next one": Check(
+        "checkpoint/sqlite/in_hand.py",
+        "self._at(place)[1] = word | WAITS",
+        "pass",
+        KILLING,
+        "at_work_once",
+    ),
+    "threads that may have ended the root run one at a time": Check(
+        "checkpoint/life/recorded_context.py",
+        "self._cell.node.threads.alone if alone else",
+        "self._cell.node.threads.alone if False else",
+        KILLING,
+        "of_several_turns",
     ),
     "an ask is handed on to somebody who is not started yet": Check(
         "checkpoint/home/outputs.py",
