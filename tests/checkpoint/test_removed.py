@@ -1157,9 +1157,9 @@ CHECKS = {
         "test_the_message_that_has_waited_longest",
     ),
     "a turn that rests is not blamed for the end of its process": Check(
-        "checkpoint/life/recorded_life.py",
-        "OVER if how and self.waits.resting else how",
-        "how",
+        "checkpoint/life/life_state.py",
+        "OVER if any(type(kind) is tuple for kind in out) else WAITS | IDLE",
+        "WAITS",
         "tests/effects/test_long_waits.py",
         "test_a_turn_waits_on_whatever_ends and process",
     ),
@@ -1172,8 +1172,8 @@ CHECKS = {
     ),
     "a turn that waits for a message no more rests no longer": Check(
         "checkpoint/life/recorded_context.py",
-        "            self._life.waits.rested()  #",
-        "            pass  #",
+        "        self._life.waits.rested(self)  # At once",
+        "        pass  # At once",
         "tests/effects/test_waiting_turns.py",
         "test_a_turn_that_goes_on_rests_no_longer and gave",
     ),
