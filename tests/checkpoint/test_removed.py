@@ -1115,10 +1115,17 @@ CHECKS = {
     ),
     "a turn that waits for a message no more rests no longer": Check(
         "checkpoint/life/recorded_context.py",
-        "            self._life.waits.rested()  #",
-        "            pass  #",
+        "        self._life.waits.rested(self)  #",
+        "        pass  #",
         "tests/effects/test_waiting_turns.py",
         "test_a_turn_that_goes_on_rests_no_longer and gave",
+    ),
+    "what an earlier turn has waited for is nothing that this one rests for": Check(
+        "checkpoint/life/life_state.py",
+        "tuple(other for other in self.resting if other is not one)",
+        "self.resting[1:]",
+        "tests/effects/test_left_after_changes.py",
+        "test_an_earlier_turn and task",
     ),
     "the journal goes on with the outputs of a turn where it had come to": Check(
         "checkpoint/home/input_ledger.py",

@@ -610,7 +610,7 @@ CHECKS = {
     ),
     "the specification is in the store with the states": Check(
         "system/transaction/transaction.py",
-        "        system._specifications.changed(*self._draft.below_root(), mechanisms)\n",
+        "        system._specifications.changed(*self._draft.below_root(), self._draft.gone(), mechanisms)\n",
         "        pass\n",
         KEPT,
         "test_a_root_that_is_killed and finish",
