@@ -1177,6 +1177,13 @@ CHECKS = {
         "tests/effects/test_waiting_turns.py",
         "test_a_turn_that_goes_on_rests_no_longer and gave",
     ),
+    "what an earlier turn has waited for is nothing that this one rests for": Check(
+        "checkpoint/life/life_state.py",
+        "tuple(other for other in self.resting if other is not one)",
+        "self.resting[1:]",
+        "tests/effects/test_left_after_changes.py",
+        "test_an_earlier_turn and task",
+    ),
     "the journal goes on with the outputs of a turn where it had come to": Check(
         "checkpoint/home/input_ledger.py",
         "self.released[more[0] if more else 0 :] = digests",
