@@ -47,11 +47,12 @@ def test_what_kills_is_put_aside_and_what_waits_is_not(tmp_path: Path, guilty: l
     steps = [
         f"{kind}:{first}:{then}" for kind, of in (("innocent", innocent), ("guilty", guilty)) for first, then in of
     ]
-    lives = [live(tmp_path / "app.db", steps) for _ in range(2 * len(guilty) + (10 if IS_CROSSED else 3))]
-    deaths = 2 * len(guilty)
-    assert [is_at_its_end for is_at_its_end, _ in lives] == [index >= deaths for index in range(len(lives))]
-    expected = [[f"/app/guilty{len(innocent) + index}", 2] for index in range(len(guilty))]
-    assert [sorted(aside) for _, aside in lives[deaths:]] == [sorted(expected)] * (len(lives) - deaths)
+    store, most = tmp_path / "app.db", 3 * len(guilty)
+    deaths = next((count for count in range(most + 1) if live(store, steps)[0]), -1)
+    assert 2 * len(guilty) <= deaths  # More, if somebody else was at work when a thread has killed the program.
+    expected = sorted([f"/app/guilty{len(innocent) + index}", 2] for index in range(len(guilty)))
+    for _ in range(9 if IS_CROSSED else 2):
+        assert sorted(live(store, steps)[1]) == expected
 
 
 def test_of_several_turns_with_threads_the_one_that_kills_is_put_aside(tmp_path: Path) -> None:
