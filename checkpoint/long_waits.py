@@ -173,9 +173,14 @@ class LongWaits:
     # -- asks that change nothing -----------------------------------------------------------------------------------
 
     def show(self, sources: Iterable[Input]) -> None:
-        """Have the life answer those of these inputs beside its turn that are asks and change nothing."""
+        """Have the life answer those of these inputs beside its turn that are asks and change nothing.
+
+        Not while a turn that had begun in an earlier life comes so far again: what was seen then is not unseen.
+        """
         home = self._home
         if home.life.port is None or not home.life.is_released:
+            return
+        if home.life.owed and not home.life.has_come_so_far(home.ledger.turn + 1):
             return
         for source in sources:
             if source.ask is not None and not source.ask.is_done and self._home.changes_nothing(source):

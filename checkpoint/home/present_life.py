@@ -50,6 +50,7 @@ class PresentLife:
         settled: ends when the turn that had begun before is as far as it was, or waits; None if nobody follows a start.
         owed: how many outputs that turn had let out.
         told: how many outcomes the life was told.
+        heard: how many of them it has said that it has heard, while it comes as far as an earlier one.
         is_released: whether it gets what is new.
         waits_for_release: whether somebody else says when it gets that.
         is_kept_back: whether it waits for the others of its group.
@@ -70,6 +71,7 @@ class PresentLife:
     settled: asyncio.Future[None] | None = None
     owed: int = 0
     told: int = 0
+    heard: int = 0
     is_released: bool = False
     waits_for_release: bool = False
     is_kept_back: bool = False
@@ -124,7 +126,7 @@ class PresentLife:
 
     def attach(self, port: LifePort) -> None:
         """Begin the replay to it."""
-        self.port, self.seen_turn, self.owed, self.told = port, -1, 0, 0
+        self.port, self.seen_turn, self.owed, self.told, self.heard = port, -1, 0, 0, 0
 
     def come_up(self, restore_seconds: float) -> None:
         """Tell whoever waits for it that it has caught up."""
@@ -150,8 +152,13 @@ class PresentLife:
 
     def waits(self, heard: int) -> None:
         """The turn that had begun waits, and it has heard so many outcomes: if that is all, it goes on when it can."""
+        self.heard = heard
         if heard >= self.told:
             self.settle()
+
+    def has_come_so_far(self, turn: int) -> bool:
+        """Whether a turn that had begun in an earlier life is as far as somebody may have seen it then."""
+        return self.seen_of(turn) >= self.owed and self.heard >= self.told
 
     def fail(self, error: Exception) -> bool:
         """Tell whoever waits for it that it will not catch up; False if nobody does, or follows its start."""

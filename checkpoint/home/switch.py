@@ -490,6 +490,7 @@ class Switch:
                     self.images.mark(record)
                 case Waits():
                     life.waits(record.heard)
+                    self._show()
                 case LeavesTurn():
                     self.calls.strand()
                 case Ignored():
@@ -512,6 +513,12 @@ class Switch:
         batch.commit(self.journal)
         if self.life.owed and self.life.seen_of(record.turn) >= self.life.owed:
             self.life.settle()
+            self._show()
+
+    def _show(self) -> None:
+        """What changes nothing is answered beside a turn of an earlier life as soon as that has come so far again."""
+        if self.life.owed:
+            self.calls.rests.show(self.ledger.open.values())
 
     def _take(self, turn: int, key: int, outs: list[Out], batch: Batch) -> None:
         """Let new outputs out; drop those that are out already."""

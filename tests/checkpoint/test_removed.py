@@ -1170,6 +1170,13 @@ CHECKS = {
         "tests/effects/test_waiting_turns.py",
         "test_a_turn_that_goes_on_rests_no_longer and went",
     ),
+    "who looks beside a turn after a crash sees nothing older than before": Check(
+        "checkpoint/long_waits.py",
+        "if home.life.owed and not home.life.has_come_so_far(home.ledger.turn + 1):",
+        "if False:",
+        "tests/effects/test_glances_at_effects.py",
+        "test_kills_between_all_steps",
+    ),
     "a turn that waits for a message no more rests no longer": Check(
         "checkpoint/life/recorded_context.py",
         "        self._life.waits.rested(self)  # At once",

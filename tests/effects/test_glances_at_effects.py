@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import time
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +19,12 @@ PATH = "/app/poster"
 
 
 class Post(hf.Message[list[str]]):
-    """Make effects that last until there are files of these names, one after another."""
+    """Make effects that last until there are files of these names, one after another, and compute before each."""
 
     folder: str
     names: list[str]
     at_most_once: bool = False
+    seconds: float = 0.0
 
 
 class See(hf.Message[list[str]]): ...
@@ -55,6 +57,7 @@ class Poster(hf.Actor):
         for name in message.names:
             self.seen.append(f"to {name}")
             there = wait_for_file if name == "in a thread" else file_there
+            time.sleep(message.seconds)
             done = await self.ctx.effect(there, message.folder, name, key=name, at_most_once=message.at_most_once)
             self.seen.append(done)
         return self.seen
@@ -109,17 +112,20 @@ async def test_it_is_seen_what_there_was_before_the_effect_and_all_else_waits(
 async def test_kills_between_all_steps_change_nothing(tmp_path: Path, isolation: str) -> None:
     async with running(tmp_path, "os") as system:
         ref = await system.start(poster(isolation))
-        asked = asyncio.ensure_future(ref.ask(Post(str(tmp_path), list("abc")), IN_TIME))
+        asked = asyncio.ensure_future(ref.ask(Post(str(tmp_path), list("abc"), seconds=0.05), IN_TIME))
         said, count = list[str](), 0
         for name in "abc":
             said.append(f"to {name}")
             count += 1
             await begun(tmp_path, count)
-            seen = ref.ask(See(), IN_TIME)
+            seen = [ref.ask(See(), IN_TIME)]
             await end_of(system, isolation, PATH)
             count += 1
+            while not seen[0].done():  # Whoever asks while the next life comes so far again sees nothing older.
+                seen.append(ref.ask(See(), IN_TIME))
+                await asyncio.sleep(0.001)
             await begun(tmp_path, count)
-            assert await seen == said
+            assert all(one == said for one in await asyncio.gather(*seen))
             assert await ref.ask(See(), IN_TIME) == said
             (tmp_path / name).touch()
             said.append(name)
