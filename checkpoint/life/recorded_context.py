@@ -7,7 +7,7 @@ import contextlib
 import functools
 import hashlib
 import types
-from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Generator
+from collections.abc import AsyncGenerator, Awaitable, Callable, Coroutine, Generator
 from random import Random
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
@@ -501,24 +501,23 @@ class RecordedContext(ActorContext):
     @types.coroutine
     def _stepped(self, turn: int, work: Coroutine[Any, Any, None]) -> Generator[Any, Any, None]:
         """Step what works for a turn that waits: if a step ends the process, the turn has ended it."""
-        step, value = work.send, None
+        step: Callable[[], Any] = functools.partial(work.send, None)
         while True:
             try:
                 with self.recorded.work_beside(turn):
-                    waiting = step(value)
+                    waiting = step()
             except StopIteration:
                 return
             try:
-                value = yield waiting
-                step = work.send
+                step = functools.partial(work.send, (yield waiting))
             except GeneratorExit:
                 work.close()
                 raise
             except BaseException as error:
-                step, value = work.throw, error
+                step = functools.partial(work.throw, error)
 
     @contextlib.asynccontextmanager
-    async def _in_thread(self, place: tuple[int, int], *, alone: bool) -> AsyncIterator[None]:
+    async def _in_thread(self, place: tuple[int, int], *, alone: bool) -> AsyncGenerator[None, None]:
         """Around an attempt in a thread, which may end the process unseen; `alone`: one such attempt at a time."""
         waits = self.recorded.waits
         async with self._cell.node.threads.alone if alone else contextlib.nullcontext():

@@ -10,7 +10,7 @@ import contextlib
 import functools
 import hashlib
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from typing import TYPE_CHECKING, Any, Final, NoReturn, Protocol
 
 from ...actors.control.trace_tail import follow
@@ -362,7 +362,7 @@ class Life:
             self.word.mark(self.waits.how(self.turn) if waits else 0)
 
     @contextlib.contextmanager
-    def work_beside(self, turn: int) -> Iterator[None]:
+    def work_beside(self, turn: int) -> Generator[None, None, None]:
         """What is done in here is work for this turn, while it waits."""
         waits = self.word is not None and self.feed is not None and turn == self.turn and self.word.how != 0
         if waits:

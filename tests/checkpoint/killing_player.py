@@ -13,6 +13,7 @@ import signal
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import holdfast as hf
 
@@ -80,9 +81,8 @@ class Worker(hf.Actor):
         elif message.then == "fatal thread":
             await self.ctx.effect(block_and_kill)
         elif message.then == "fatal race":
-            await asyncio.wait(
-                [self.ctx.effect(block_and_kill), self.ctx.wait_for(Cancel)], return_when=asyncio.FIRST_COMPLETED
-            )
+            racing: list[asyncio.Future[Any]] = [self.ctx.effect(block_and_kill), self.ctx.wait_for(Cancel)]
+            await asyncio.wait(racing, return_when=asyncio.FIRST_COMPLETED)
         elif message.then == "fatal code":
             kill()
         else:

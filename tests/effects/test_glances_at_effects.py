@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +49,10 @@ def wait_for_file(folder: str, name: str) -> str:
     return asyncio.run(file_there(folder, name))
 
 
+THERE: dict[bool, Callable[[str, str], Any]] = {True: wait_for_file, False: file_there}
+"""What waits for a file, in a thread and not."""
+
+
 class Poster(hf.Actor):
     def __init__(self) -> None:
         self.seen: list[str] = []
@@ -56,8 +61,8 @@ class Poster(hf.Actor):
     async def post(self, message: Post) -> list[str]:
         for name in message.names:
             self.seen.append(f"to {name}")
-            there = wait_for_file if name == "in a thread" else file_there
             time.sleep(message.seconds)
+            there = THERE[name == "in a thread"]
             done = await self.ctx.effect(there, message.folder, name, key=name, at_most_once=message.at_most_once)
             self.seen.append(done)
         return self.seen

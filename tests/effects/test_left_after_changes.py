@@ -55,7 +55,7 @@ class Waiting(Patient):
     clinic: hf.Binding[Clinic]
 
     @hf.on(Go)
-    async def go(self, message: Go) -> str:
+    async def go(self, message: Go) -> str | hf.ReplyHandle[str]:
         if message.file == "effect":
             await self.ctx.effect(pause)
         if message.file == "ask":

@@ -67,8 +67,8 @@ async def test_who_is_at_rest_goes_on_while_another_one_is_restarted(
     """Nothing of what it has done meanwhile is lost, whether the transaction comes about or not."""
     backoff = hf.Backoff(AWAY, jitter=0.0)
     one = hf.child("one", hf.start(Counter, 5), isolation=isolation, recovery=hf.hybrid(interval=60.0), backoff=backoff)
-    held = hf.child("held", hf.start(Counter), recovery=hf.hybrid(interval=60.0))
-    await system.start(hf.supervisor("top", intensity=99, children=[one, held]))
+    other = hf.child("held", hf.start(Counter), recovery=hf.hybrid(interval=60.0))
+    await system.start(hf.supervisor("top", intensity=99, children=[one, other]))
     away, held = ref(system, "/app/top/one"), ref(system, "/app/top/held")
     gap = Gap(held)
     killed: list[float] = []
