@@ -56,7 +56,7 @@ class Cone(NamedTuple):
         return frozenset(step.needs[0] for step in self.convicted)
 
 
-class Claim(NamedTuple):
+class NumberedExpectation(NamedTuple):
     """What an expectation says in numbers: `atom` holds while `needs` work and the atoms `given` hold."""
 
     atom: int
@@ -97,17 +97,19 @@ class Index:
         busy = {one for step in self.steps if self.is_work(step.head) for one in step.needs}
         self.only_run = frozenset(range(len(self.names))) - busy
         """Components of which nothing else follows than that they run."""
-        self.claims = tuple(self._claims(model))
+        self.expectations = tuple(self._expectations(model))
         """What is expected and somebody is to see."""
         self.unconditional = tuple(step for step in self.steps if not step.needs)
         """Rules that hold whoever is faulty: they can make observations contradict the model."""
 
-    def _claims(self, model: Model) -> Iterator[Claim]:
+    def _expectations(self, model: Model) -> Iterator[NumberedExpectation]:
         words = model.vocabulary
         for one in model.declaration.expectations:
             if not one.is_quiet:
                 given = tuple(self.atom[words.parse(text)] for text in one.given)
-                yield Claim(self.atom[words.parse(one.atom)], tuple(self.number[name] for name in one.of), given)
+                yield NumberedExpectation(
+                    self.atom[words.parse(one.atom)], tuple(self.number[name] for name in one.of), given
+                )
 
     def is_work(self, atom: int) -> bool:
         """Whether an atom says something of the work of a component: more than that it runs, and has room."""

@@ -17,7 +17,7 @@ from ..literals import Literal
 from ..model import Declaration, Model, System
 from ..observations import Contradiction, Observed
 from .breath import beside_a_loop, breathe, breathing
-from .cone import Claim, Cone, Index, RulePart, cone_of, contradiction
+from .cone import Cone, Index, NumberedExpectation, RulePart, cone_of, contradiction
 from .explain import Explanation, explain
 from .probe import Probe, probes
 from .rank import Ranked, Ranking, merged, products
@@ -201,9 +201,9 @@ class Diagnoser:
         atoms = (self._index.atoms[one.atom] for one in self._unseen(positive, negative))
         return tuple(dict.fromkeys(atom for atom in atoms if atom is not None))
 
-    def _unseen(self, positive: frozenset[int], negative: frozenset[int]) -> Iterator[Claim]:
+    def _unseen(self, positive: frozenset[int], negative: frozenset[int]) -> Iterator[NumberedExpectation]:
         known = positive | negative
-        return (one for one in self._index.claims if one.atom not in known and negative.isdisjoint(one.given))
+        return (one for one in self._index.expectations if one.atom not in known and negative.isdisjoint(one.given))
 
     def _unknown(self, positive: frozenset[int], negative: frozenset[int]) -> tuple[str, ...]:
         """The components of whose work nothing is seen; that one runs says nothing of its work, if it has any.

@@ -130,7 +130,7 @@ class KeeperWatch:
             self._timer.cancel()
 
     def close(self) -> None:
-        """The keeper has ended."""
+        """Let go of the program, for its keeper has ended."""
         self._owed.close()
         self._cancel()
         self._close_program()
