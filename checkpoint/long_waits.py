@@ -180,7 +180,7 @@ class LongWaits:
         home = self._home
         if home.life.port is None or not home.life.is_released:
             return
-        if home.life.owed and not home.life.has_come_so_far(home.ledger.turn + 1):
+        if home.life.owed and not home.life.is_as_far:
             return
         for source in sources:
             if source.ask is not None and not source.ask.is_done and self._home.changes_nothing(source):

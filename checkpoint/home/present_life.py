@@ -51,6 +51,7 @@ class PresentLife:
         owed: how many outputs that turn had let out.
         told: how many outcomes the life was told.
         heard: how many of them it has said that it has heard, while it comes as far as an earlier one.
+        is_as_far: whether the turn that an earlier life had begun has come as far as it was.
         is_released: whether it gets what is new.
         waits_for_release: whether somebody else says when it gets that.
         is_kept_back: whether it waits for the others of its group.
@@ -72,6 +73,7 @@ class PresentLife:
     owed: int = 0
     told: int = 0
     heard: int = 0
+    is_as_far: bool = False
     is_released: bool = False
     waits_for_release: bool = False
     is_kept_back: bool = False
@@ -126,7 +128,8 @@ class PresentLife:
 
     def attach(self, port: LifePort) -> None:
         """Begin the replay to it."""
-        self.port, self.seen_turn, self.owed, self.told, self.heard = port, -1, 0, 0, 0
+        self.port, self.seen_turn, self.owed = port, -1, 0
+        self.told, self.heard, self.is_as_far = 0, 0, False
 
     def come_up(self, restore_seconds: float) -> None:
         """Tell whoever waits for it that it has caught up."""
@@ -156,9 +159,12 @@ class PresentLife:
         if heard >= self.told:
             self.settle()
 
-    def has_come_so_far(self, turn: int) -> bool:
-        """Whether a turn that had begun in an earlier life is as far as somebody may have seen it then."""
-        return self.seen_of(turn) >= self.owed and self.heard >= self.told
+    def comes_so_far(self, turn: int) -> bool:
+        """Whether a turn that had begun in an earlier life is as far now, for the first time, as it was seen then."""
+        if self.is_as_far or self.seen_of(turn) < self.owed or self.heard < self.told:
+            return False
+        self.is_as_far = True
+        return True
 
     def fail(self, error: Exception) -> bool:
         """Tell whoever waits for it that it will not catch up; False if nobody does, or follows its start."""

@@ -517,7 +517,7 @@ class Switch:
 
     def _show(self) -> None:
         """What changes nothing is answered beside a turn of an earlier life as soon as that has come so far again."""
-        if self.life.owed:
+        if self.life.owed and self.life.comes_so_far(self.ledger.turn + 1):
             self.calls.rests.show(self.ledger.open.values())
 
     def _take(self, turn: int, key: int, outs: list[Out], batch: Batch) -> None:

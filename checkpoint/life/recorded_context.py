@@ -289,7 +289,7 @@ class RecordedContext(ActorContext):
         self._draws = {}
 
     def spawn(self, start: Start[A], name: str | None = None) -> ActorRef[A]:
-        return super().spawn(start, name or self._made_up_name())
+        return super().spawn(start, self._made_up_name() if name is None else name)
 
     def _made_up_name(self) -> str | None:
         """A name for a child that was given none; a turn that is replayed makes up the same, and no other turn does."""

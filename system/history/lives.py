@@ -69,7 +69,7 @@ class PastLife(msgspec.Struct):
 
     @property
     def author(self) -> str:
-        """Who has ended it, and why in brackets, as far as that is known."""
+        """The address or the person that has ended it, and the reason in brackets, as far as both are known."""
         return f"{self.by} ({self.because})" if self.because else self.by
 
 

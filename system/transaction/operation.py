@@ -108,11 +108,11 @@ class Operation(StagedWork):
 
     @property
     def work(self) -> StagedWork:
-        """What does it, which may do others of the same actor too."""
+        """The work that does it, which may do others of the same actor too."""
         return self
 
     def is_away(self, system: ActorSystem) -> bool:
-        """Whether its actor is between two lives, so that the next one is waited for."""
+        """Say whether its actor is between two lives, so that the next one is waited for."""
         place = self._found
         cell = None if place is None or place.is_planned else place.now(system._node)
         return cell is not None and not cell.host.is_up(cell)

@@ -143,7 +143,7 @@ CHECKS = {
     ),
     "a turn that is replayed makes up the same names": Check(
         "checkpoint/life/recorded_context.py",
-        "        return super().spawn(start, name or self._made_up_name())\n",
+        "        return super().spawn(start, self._made_up_name() if name is None else name)\n",
         "        return super().spawn(start, name)\n",
         "tests/supervision/test_made_up_ids.py",
         "replayed",
@@ -1172,7 +1172,7 @@ CHECKS = {
     ),
     "who looks beside a turn after a crash sees nothing older than before": Check(
         "checkpoint/long_waits.py",
-        "if home.life.owed and not home.life.has_come_so_far(home.ledger.turn + 1):",
+        "if home.life.owed and not home.life.is_as_far:",
         "if False:",
         "tests/effects/test_glances_at_effects.py",
         "test_kills_between_all_steps",

@@ -150,6 +150,10 @@ async def test_admin_calls_to_a_dynamic_supervisor(call: str, state: str, expect
 class RecordedKid(Kid):
     """Has no state that is worth keeping, and is recorded."""
 
+    @hf.on(Leave)
+    def leave(self, message: Leave) -> None:
+        self.ctx.stop()
+
     def get_state(self) -> int:
         return 0
 

@@ -282,4 +282,4 @@ async def test_what_effects_and_waits_have_come_to_is_exported_with_its_time(tmp
         ("message", {"word": "hello"}),
     ]
     assert all(one["time"] > 1e9 for one in got)
-    assert [one["record"] for one in export_store(path) if one["record"] == "due"] == ["due"]
+    assert [one["record"] for one in export_store(path) if one["record"] == "due"] == ["due", "due"]
