@@ -264,15 +264,15 @@ async def test_replicas_that_die_before_they_say_more_than_the_first_end_come_ba
     else:
         assert group.membership.primary is not None
         os.kill(pid_of(system, ref, group.membership.primary), signal.SIGKILL)
-    is_over = False
+    struck: Group | None = None  # which may be the one that follows the first
 
     def take_and_kill(self: Group, done: Done) -> None:
-        nonlocal is_over
-        if is_over and self is group:
+        nonlocal struck
+        if self is struck:
             return  # It was on its way when its sender died.
         take_done(self, done)
-        if self is group and any(end.turn > last for end in done.ends):
-            is_over = True
+        if struck is None and any(end.turn > last for end in done.ends):
+            struck = self
             for name in self.membership.names:
                 with contextlib.suppress(KeyError):  # It is about to be started again.
                     os.kill(pid_of(system, ref, name), signal.SIGKILL)
@@ -282,7 +282,7 @@ async def test_replicas_that_die_before_they_say_more_than_the_first_end_come_ba
         await until(note.exists)
     asked.append(ref.ask(Enter(2), IN_TIME))
     assert await asyncio.gather(*asked) == [1, 2]
-    assert is_over
+    assert struck is not None
     assert await ref.ask(Enter(3), IN_TIME) == 3
 
 

@@ -324,7 +324,7 @@ async def test_what_its_children_have_started_ends_with_the_server() -> None:
 async def test_a_fork_under_way_fails_when_the_server_dies() -> None:
     fixture = Fixture()
     await fixture.server.start()
-    os.kill(fixture.server.pid, signal.SIGSTOP)
+    hang(fixture.server.pid)
     forks = [asyncio.create_task(fixture.server.fork()) for _ in range(100)]  # more than may be in flight
     await asyncio.sleep(0)
     os.kill(fixture.server.pid, signal.SIGKILL)
