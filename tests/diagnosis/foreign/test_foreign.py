@@ -109,8 +109,8 @@ def test_of_many_pairs_of_faults_most_are_named() -> None:
     assert both >= 0.85 * 20 * TRIALS
 
 
-@pytest.mark.parametrize("mode", ["lasting", "intermittent", "cascading"])
-def test_of_many_faults_nearly_all_are_named(mode: Mode) -> None:
+@pytest.mark.parametrize(("mode", "missed"), [("lasting", 0.05), ("intermittent", 0.15), ("cascading", 0.05)])
+def test_of_many_faults_nearly_all_are_named(mode: Mode, missed: float) -> None:
     if not TRIALS:
         pytest.skip("the campaign sets HOLDFAST_FOREIGN, and has the time for it")
     wrong: list[tuple[str, tuple[str, str], str, int, Outcome]] = []
@@ -126,7 +126,7 @@ def test_of_many_faults_nearly_all_are_named(mode: Mode) -> None:
     median = statistics.median(one.seconds for one in outcomes)
     print(f"{len(outcomes)} trials, {len(wrong)} wrong, {alarms} with false alarms, named after {median:.1f} s")
     assert alarms == 0
-    assert len(wrong) <= 0.05 * len(outcomes)
+    assert len(wrong) <= missed * len(outcomes)
 
 
 @pytest.mark.parametrize("number", range(2))
