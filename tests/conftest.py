@@ -43,6 +43,7 @@ from holdfast.testing.guard.leaks import Leaks
 from holdfast.testing.guard.loop_leaks import LoopLeaks
 from holdfast.testing.guard.process_leaks import GRACE, end_processes, is_of_test
 from tests.pairs import covering
+from tests.supervision.programs import Ends
 from tests.waits import Waits
 from tests.warm import WarmServers, warm_popen
 
@@ -295,6 +296,15 @@ def nothing_left(warm_servers: WarmServers | None) -> Iterator[None]:
     assert not left, f"the test left child processes: {left}"
     grown = leaks.files()
     assert not grown, f"the test left files open: {grown}"
+
+
+@pytest.fixture
+def ends() -> Iterator[Ends]:
+    """The ends of processes that a test does not start itself."""
+    found = Ends()
+    yield found
+    for fd in found.fds:
+        os.close(fd)
 
 
 @pytest.fixture(autouse=True)

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-import os
 import re
 import socket
 import tempfile
 import textwrap
 import threading
-from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,21 +16,6 @@ import pytest
 import holdfast as hf
 from tests.actors.process.waiting import next_event
 from tests.supervision.programs import STUBBORN, Ends, info, python, refused, sh
-
-
-@pytest.fixture
-async def system() -> AsyncIterator[hf.ActorSystem]:
-    async with hf.ActorSystem("app", log=False, intensity=1000) as running:
-        yield running
-
-
-@pytest.fixture
-def ends() -> Iterator[Ends]:
-    found = Ends()
-    yield found
-    for fd in found.fds:
-        os.close(fd)
-
 
 # -- output and questions ------------------------------------------------------------------------------------------
 

@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import textwrap
-from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,21 +19,6 @@ import holdfast as hf
 from tests.actors.process.waiting import next_event, until
 from tests.supervision.programs import FAMILY, STUBBORN, Ends, family, hang, info, keeper_of, python, sh
 from tests.warm import own_children
-
-
-@pytest.fixture
-async def system() -> AsyncIterator[hf.ActorSystem]:
-    async with hf.ActorSystem("app", log=False, intensity=1000) as running:
-        yield running
-
-
-@pytest.fixture
-def ends() -> Iterator[Ends]:
-    found = Ends()
-    yield found
-    for fd in found.fds:
-        os.close(fd)
-
 
 # -- ends and restarts ---------------------------------------------------------------------------------------------
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
@@ -39,12 +38,6 @@ class Listener(hf.Actor):
     @hf.on(Lines)
     def lines(self, message: Lines) -> list[tuple[str, str, str]]:
         return list(self.heard)
-
-
-@pytest.fixture
-async def system() -> AsyncIterator[hf.ActorSystem]:
-    async with hf.ActorSystem("app", log=False, intensity=1000) as running:
-        yield running
 
 
 async def heard(listener: hf.ActorRef[Listener], count: int) -> list[str]:

@@ -6,7 +6,6 @@ import asyncio
 import os
 import signal
 import time
-from collections.abc import AsyncIterator
 
 import pytest
 
@@ -19,12 +18,6 @@ HANGS = "import time\nfor n in range(3): print('beat', flush=True)\ntime.sleep(9
 CLOSES = "import os, time\nprint('beat', flush=True)\nos.close(1)\nos.close(2)\ntime.sleep(99)"
 TRICKLES = "import time, sys\nprint('beat')\nwhile True:\n    print('.', end='', flush=True)\n    time.sleep(0.05)"
 FLOODS = "print('beat')\nwhile True: print('x' * 100)"
-
-
-@pytest.fixture
-async def system() -> AsyncIterator[hf.ActorSystem]:
-    async with hf.ActorSystem("app", log=False, intensity=1000) as running:
-        yield running
 
 
 async def ended(events: hf.events.EventStream) -> hf.ExitReason:

@@ -6,7 +6,7 @@ import asyncio
 import os
 import signal
 import time
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import Callable
 
 import pytest
 
@@ -33,20 +33,6 @@ Fate = Callable[[int], None]
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(keeper_watch, "END_SECONDS", HUNG_SECONDS)
     monkeypatch.setattr(keeper_watch, "START_SECONDS", 2.0)
-
-
-@pytest.fixture
-async def system() -> AsyncIterator[hf.ActorSystem]:
-    async with hf.ActorSystem("app", log=False, intensity=1000) as running:
-        yield running
-
-
-@pytest.fixture
-def ends() -> Iterator[Ends]:
-    found = Ends()
-    yield found
-    for fd in found.fds:
-        os.close(fd)
 
 
 def stop(pid: int) -> None:

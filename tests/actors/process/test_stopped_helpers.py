@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import time
-from collections.abc import Iterator
 
 import psutil
 import pytest
@@ -17,14 +16,6 @@ from tests.supervision.programs import Ends, hang, info, keeper_of, python
 from tests.warm import own_children
 
 PROGRAM = "import time\nprint('up', flush=True)\ntime.sleep(99)"
-
-
-@pytest.fixture
-def ends() -> Iterator[Ends]:
-    found = Ends()
-    yield found
-    for fd in found.fds:
-        os.close(fd)
 
 
 def member(**options: object) -> hf.ChildSpec[Member]:

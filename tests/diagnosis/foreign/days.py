@@ -13,13 +13,14 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 
 from tests.diagnosis.foreign.systems import SYSTEMS
-from tests.diagnosis.foreign.trials import TRAFFICS, run
+from tests.diagnosis.foreign.trials import TRAFFICS, in_its_own_loop, trial
 
 
 def healthy(name: str, kind: str, seed: int, hours: float, refusals: float) -> tuple[tuple[str, ...], float]:
     """Run a system under traffic for `hours` virtual hours; the false alarms, and the seconds of a core it took."""
     (foreign,) = (one for one in SYSTEMS if one.name == name)
-    return run(foreign, {}, kind, seed, hours * 3600.0, refusals).false_alarms, time.process_time()
+    said = in_its_own_loop(trial(foreign, {}, kind, seed, hours * 3600.0, refusals))
+    return said.false_alarms, time.process_time()
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -10,7 +10,7 @@ import pytest
 
 from tests.diagnosis.foreign.repairs import ALL_TRIALS, LONGER, off_and_on
 from tests.diagnosis.foreign.systems import SYSTEMS, Foreign
-from tests.diagnosis.foreign.trials import TRAFFICS, Mode, Outcome, run, trial
+from tests.diagnosis.foreign.trials import TRAFFICS, Mode, Outcome, in_its_own_loop, trial
 
 VIRTUAL = pytest.mark.asyncio(loop_factories=["virtual"])
 
@@ -99,7 +99,7 @@ def test_of_many_pairs_of_faults_most_are_named() -> None:
     first = both = 0
     for number in range(20 * TRIALS):
         foreign, struck, kind = rng.choice(PAIRS)
-        said = run(foreign, struck, kind, number)
+        said = in_its_own_loop(trial(foreign, struck, kind, number))
         is_first = bool(said.first) and {*said.first} <= struck.keys() and not said.false_alarms
         first, both = first + is_first, both + (said.found == struck.keys())
         if not is_first or said.found != struck.keys():
@@ -117,7 +117,7 @@ def test_of_many_faults_nearly_all_are_named(mode: Mode, missed: float) -> None:
     outcomes: list[Outcome] = []
     for seed in range(TRIALS):
         for foreign, fault, kind in ALL:
-            said = run(foreign, dict([fault]), kind, seed, mode=mode)
+            said = in_its_own_loop(trial(foreign, dict([fault]), kind, seed, mode=mode))
             outcomes.append(said)
             if said.first != (fault[0],) or said.false_alarms:
                 wrong.append((foreign.name, fault, kind, seed, said))

@@ -176,16 +176,3 @@ def in_its_own_loop(trial: Coroutine[Any, Any, T]) -> T:
     """Run one trial in a loop of its own, for as long as it takes."""
     with asyncio.Runner(loop_factory=lambda: VirtualClockLoop(jumps=JUMPS)) as runner:
         return runner.run(trial)
-
-
-def run(
-    foreign: Foreign,
-    struck: dict[str, str],
-    kind: str,
-    seed: int,
-    healthy: float = 0.0,
-    refusals: float = 0.0,
-    mode: Mode = "lasting",
-) -> Outcome:
-    """Run one trial in a loop of its own, for as long as it takes."""
-    return in_its_own_loop(trial(foreign, struck, kind, seed, healthy, refusals, mode))
