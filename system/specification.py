@@ -321,10 +321,13 @@ class Specifications:
             spec = there.get(address) if address not in removed else None
             if spec is None:
                 self._added.discard(address)
-                self._note_away(address)
+                if address not in self._away:
+                    self._keep(address, None)
             elif self._away.pop(address, None) is not None or spec is not self._seen.get(address):
                 self._seen[address] = spec
                 self._note(address, spec, before)
+        for address in list(self._away):
+            self._note_away(address, there)
         self._note_root(removed)
         self._packer.forget()
 
@@ -338,17 +341,28 @@ class Specifications:
             started = [name for name in known if name in order]
             self._keep_root(supervisor._flags, order if order != started else [])
 
-    def _note_away(self, address: str) -> None:
-        where = self._away.get(address)
-        if where is None:
-            self._keep(address, None)
-            return
+    def _note_away(self, address: str, there: Mapping[str, ChildSpec]) -> None:
+        where = self._away[address]
         was, why = self._packed(self._declared[address])
+        if not why and where and not self._comes_back(where, there):
+            why = f"it was moved to {where}, where the next root starts nobody: it is where the program says then"
         if why:
+            del self._away[address]
             self._keep(address, None)
             self._homes.node.emit(SpecificationNotKept(address, why))
         else:
             self._keep(address, msgspec.msgpack.encode((_digest(was), msgspec.msgpack.encode(where))))
+
+    def _comes_back(self, address: str, there: Mapping[str, ChildSpec]) -> bool:
+        """Whether the next root has somebody at an address below one of its children: by a spec, or by a journal."""
+        name, *below = address.removeprefix(f"{self._root}/").split("/")
+        top = f"{self._root}/{name}"
+        spec = there.get(top) if top in self._kept else self._declared.get(top)
+        for name in below:
+            if spec is None or _is_journaled(spec):
+                break
+            spec = next((one for one in _children(spec) if one.id == name), None)
+        return spec is not None
 
     def _note(self, address: str, spec: ChildSpec, before: Mapping[str, Any]) -> None:
         declared = None if address in self._added else self._declared[address]
@@ -521,6 +535,12 @@ def _children(spec: ChildSpec) -> tuple[ChildSpec, ...]:
     args = spec.start.args
     below = args[1] if spec.is_supervisor and len(args) == 2 and isinstance(args[1], tuple) else ()
     return below if all(isinstance(one, ChildSpec) for one in below) else ()
+
+
+def _is_journaled(spec: ChildSpec) -> bool:
+    """Whether it is a supervisor that has a journal of its children."""
+    flags = spec.start.args[0] if spec.is_supervisor and spec.start.args else None
+    return isinstance(flags, Flags) and flags.journal
 
 
 def _with_children(spec: ChildSpec, below: tuple[ChildSpec, ...]) -> ChildSpec:

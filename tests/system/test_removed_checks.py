@@ -1234,6 +1234,20 @@ CHECKS = {
         KEPT,
         "test_who_was_removed_by",
     ),
+    "who was moved to where nobody brings it back is where the program says": Check(
+        "system/specification.py",
+        "        if not why and where and not self._comes_back(where, there):\n",
+        "        if False:\n",
+        KEPT,
+        "test_who_was_moved_to_where",
+    ),
+    "a journal brings back who was moved there": Check(
+        "system/specification.py",
+        "            if spec is None or _is_journaled(spec):\n",
+        "            if spec is None:\n",
+        KEPT,
+        "test_who_was_moved_to_where",
+    ),
     "who was moved below what is newer is where the program says": Check(
         "system/specification.py",
         "        back = self.void_below(address) if is_newer else []\n",

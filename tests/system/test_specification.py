@@ -37,6 +37,11 @@ def right() -> hf.ChildSpec:
     return hf.supervisor("right", children=[counter("d"), client, counter("s", 500, recovery=RECORDED)])
 
 
+class Odd(Counter):
+    def __init__(self, odd: Any) -> None:
+        super().__init__()
+
+
 @asynccontextmanager
 async def program(store: Path, *, fresh: bool = False, first: Any = None) -> AsyncGenerator[hf.ActorSystem]:
     """The program whose root ends and is started again."""
@@ -285,6 +290,34 @@ async def test_who_was_moved_away_from_the_root_lives_where_it_was_moved(tmp_pat
         return
     async with begun("/app/one", first=counter("one", recovery=recovery, shutdown=3.0)) as system:  # It is newer.
         assert system._node.find("/app/left/one") is not None
+
+
+@pytest.mark.parametrize("below", ["process", "journaled", "dynamic", "unstorable"])
+async def test_who_was_moved_to_where_the_next_root_starts_nobody_is_where_the_program_says(
+    tmp_path: Path, below: str
+) -> None:
+    odd: Any = lambda: 5  # noqa: E731
+    spec = {
+        "process": hf.supervisor("to", isolation="process"),
+        "journaled": hf.dynamic("to", journal=True),
+        "dynamic": hf.dynamic("to"),
+        "unstorable": hf.supervisor("to", children=[hf.child("y", hf.start(Odd, odd))]),
+    }[below]
+    one = counter("one", recovery=RECORDED)
+    comes_back = below in ("process", "journaled")
+    async with program(tmp_path / "store") as system:
+        await system.start(spec)
+        await (await system.start(one)).ask(Add(2))
+        with system.events() as stream:
+            async with system.transaction(timeout=IN_TIME) as change:
+                change.move("/app/one", "/app/to")
+            told = {event.address for event in stream.take() if isinstance(event, SpecificationNotKept)}
+        assert ("/app/one" in told) is not comes_back
+    async with program(tmp_path / "store") as system:
+        await system.start(spec)
+        found = await system.start(one)
+        assert found.path == ("/app/to/one" if comes_back else "/app/one")
+        assert await found.ask(Add(1), IN_TIME) == (3 if comes_back else 1)
 
 
 async def test_who_was_removed_by_a_transaction_stays_so_until_somebody_says_otherwise(tmp_path: Path) -> None:
