@@ -30,6 +30,7 @@ from ..errors import (
     type_name,
 )
 from ..values.arrays import described_dtype
+from ..values.declared_types import holds_set, lost_class, lost_from
 from .cell import GONE
 from .envelope import ReplyHandle, refuse
 from .message import Message, Refusal, RuntimeCall, UnknownRefusal, find_refusal, message_name, reply_type
@@ -94,13 +95,20 @@ class Codec:
         self._decoders: dict[Any, Callable[[Any], Any]] = {}
         self._reply_decoders: dict[type[Message[Any]], Callable[[Any], Any]] = {}
 
-    def encode(self, value: object, actor: str) -> bytes:
+    def encode(self, value: object, actor: str, declared: Any = None) -> bytes:
         """The payload's bytes.
 
+        Args:
+            value: what is sent.
+            actor: for whom it is.
+            declared: the type that it was declared with; that of the value if left out.
+
         Raises:
-            BadMessage: naming the type and what in it cannot be coded, or that it is too large.
+            BadMessage: naming the type and what in it cannot be coded or would get lost, or that it is too large.
         """
         try:
+            if lost := lost_class(value) if declared is None else lost_from(declared, value):
+                raise TypeError(lost)
             body = self.encoder.encode(value)
         except Exception as error:  # msgspec raises what a hook or a field's own code raises: all means "not codable".
             raise BadMessage(actor, type_name(type(value)), unencodable(value, error)) from error
@@ -120,12 +128,12 @@ class Codec:
             BadMessage: as `encode`.
         """
         if not holds_set(type(value) if declared is None else declared):
-            return self.encode(value, actor)
+            return self.encode(value, actor, declared)
         try:
             same = alike(value)
         except Exception as error:  # As in `encode`.
             raise BadMessage(actor, type_name(type(value)), unencodable(value, error)) from error
-        return self.encode(same, actor)
+        return self.encode(same, actor, declared)
 
     def parcel(self, message: Message[Any], actor: str) -> Parcel:
         """Encode a message, with the name of its type beside the bytes."""
@@ -215,8 +223,19 @@ class Codec:
 
     # -- errors -----------------------------------------------------------------------------------------------------
 
-    def encode_error(self, error: BaseException) -> tuple[str, str, bytes]:
-        """An error as (kind, class name, payload): a Refusal or HoldfastError stays its class, all else is a crash."""
+    def encode_error(
+        self, error: BaseException, actor: str = "another process", asked: str = "what it was asked"
+    ) -> tuple[str, str, bytes]:
+        """An error as (kind, class name, payload): a Refusal or HoldfastError stays its class, all else is a crash.
+
+        One with a field that cannot be sent is a reply of `actor`, to a message of type `asked`, that cannot.
+        """
+        try:
+            return self._encode_error(error)
+        except BadMessage as bad:
+            return self._encode_error(BadReply(actor, asked, f"{type_name(type(error))}: {bad.problem}"))
+
+    def _encode_error(self, error: BaseException) -> tuple[str, str, bytes]:
         if isinstance(error, Refusal):
             schema = type(error).schema()
             fields = schema(*(getattr(error, name) for name in schema.__struct_fields__))
@@ -273,33 +292,6 @@ def encode_special(value: Any) -> Any:
     if isinstance(value, ReplyHandle):
         raise TypeError("a reply handle cannot be sent; have another actor answer with ctx.forward()")
     raise TypeError(f"a value of type {type_name(type(value))} cannot be sent")
-
-
-def _holds_set(declared: Any) -> bool:
-    """Whether there is a set somewhere in what this type declares.
-
-    >>> holds_set(dict[str, list[frozenset[str]]]), holds_set(dict[str, float]), holds_set(Any), holds_set(set)
-    (True, False, False, True)
-    """
-    try:
-        waiting: list[Any] = [msgspec.inspect.type_info(declared)]
-    except Exception:  # It is no type that a payload is decoded as: the codec says so, in its own words.
-        return False
-    seen: set[int] = set()
-    while waiting:
-        part = waiting.pop()
-        if isinstance(part, (msgspec.inspect.SetType, msgspec.inspect.FrozenSetType)):
-            return True
-        if isinstance(part, (msgspec.inspect.Type, msgspec.inspect.Field)) and id(part) not in seen:
-            seen.add(id(part))
-            waiting.extend(getattr(part, name) for name in part.__struct_fields__)
-        elif isinstance(part, tuple):
-            waiting.extend(part)
-    return False
-
-
-holds_set: Callable[[Any], bool] = functools.cache(_holds_set)
-"""Whether there is a set somewhere in what a type declares."""
 
 
 def alike(value: Any) -> Any:

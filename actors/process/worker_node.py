@@ -255,6 +255,7 @@ class Guest(Peer):
     def publish(self, topic: str, item: Envelope) -> asyncio.Future[None]:
         """Publish through the root; the future ends when every subscriber has accepted."""
         connection = self.connection
+        self.require_whole(topic, item.message)
         name, body = self._payload(item.message)
         source = None if item.sender is None else connection.names.to_wire(item.sender.path)
         key, accepted = self.acceptance()

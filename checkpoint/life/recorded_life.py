@@ -496,7 +496,8 @@ class Life:
 
     def answer_error(self, error: BaseException) -> Answer:
         """An error as the asker will get it."""
-        return Answer(*self.cell.node.codec.encode_error(error))
+        asked = "what it was asked" if self.feed is None else self.feed.name.replace(":", ".")
+        return Answer(*self.cell.node.codec.encode_error(error, self.cell.path, asked))
 
     def answer_value(self, value: object, declared: Any, asked: str) -> Answer:
         """A reply to a message of type `asked` as the asker will get it; one that cannot be coded becomes an error."""

@@ -166,10 +166,11 @@ class Before(Brick):
         """
         codec, message = self._standing.node.codec, self.message_of(request)
         kind: type[Message[Any]] = type(message)
+        declared = None if message is None else reply_type(kind)
         try:
-            body = codec.encode(reply, self._standing.address)
+            body = codec.encode(reply, self._standing.address, declared)
             if message is not None:
-                codec.decode(reply_type(kind), body)
+                codec.decode(declared, body)
         except (BadMessage, msgspec.MsgspecError) as error:
             problem = error.problem if isinstance(error, BadMessage) else str(error)
             return self.refuse(

@@ -56,8 +56,44 @@ STASH = "tests/system/test_stash_everywhere.py"
 UNCODABLE = "tests/system/test_uncodable.py"
 SHUTDOWN = "tests/supervision/test_shutdown.py"
 WRONG = "tests/system/test_wrong_values.py"
+DECLARED = "tests/supervision/test_declared_classes.py"
 
 CHECKS = {
+    "a message does not lose a class on its way to another process": Check(
+        "actors/process/wire/peer.py",
+        "        if type(message) not in self.kinds_out and (lost := lost_class(message)):\n",
+        "        if type(message) not in self.kinds_out and (lost := lost_class(None)):\n",
+        DECLARED,
+        "hands_one_on and process",
+    ),
+    "a kind of message that may lose a class is looked at each time": Check(
+        "actors/process/wire/peer.py",
+        "        if type(name) is int and not places(kind):",
+        "        if type(name) is int:",
+        DECLARED,
+        "a_message_is_refused and field and process",
+    ),
+    "a reply does not lose a class on its way from another process": Check(
+        "actors/process/wire/peer.py",
+        "            if lost := lost_from(reply_type(kind), reply):\n",
+        "            if lost := lost_from(None, reply):\n",
+        DECLARED,
+        "a_reply_is_refused and process and rows",
+    ),
+    "no message, reply or refusal loses a class in a journal": Check(
+        "actors/kernel/codec.py",
+        "            if lost := lost_class(value) if declared is None else lost_from(declared, value):\n",
+        "            if lost := lost_class(None):\n",
+        DECLARED,
+        "a_message_is_refused and recorded",
+    ),
+    "a refusal that cannot be sent is a reply that cannot": Check(
+        "actors/kernel/codec.py",
+        "            return self._encode_error(BadReply(actor, asked, f\"{type_name(type(error))}: {bad.problem}\"))\n",
+        "            raise bad\n",
+        DECLARED,
+        "a_reply_is_refused and refusal and recorded",
+    ),
     "who did not stand still in time is tried again": Check(
         "system/transaction/reparenting.py",
         "            self._senders.have_all_rest()\n",

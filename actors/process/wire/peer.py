@@ -19,7 +19,8 @@ from ...kernel.cell import Cell, Order
 from ...kernel.codec import Codec, Parcel, Raw
 from ...kernel.envelope import Ask, Chain, Envelope, Item, chain_of, message_in, waiters
 from ...kernel.lifecycle import NEAR
-from ...kernel.message import Message, message_name
+from ...kernel.message import Message, message_name, reply_type
+from ...values.declared_types import lost_class, lost_from, places
 from . import frames
 from .connection import Connection
 from .frames import BadFrame
@@ -74,6 +75,7 @@ class Peer:
                 self._send_ask(cell, path, item, number)
                 return
             source, chain, message = item.sender, item.chain, item.message
+        self.require_whole(path, message)
         # Names are numbered by first use: here in the order in which the other side reads them.
         to = connection.names.to_wire(path)
         name, body = self._payload(message)
@@ -82,6 +84,7 @@ class Peer:
 
     def _send_ask(self, cell: Cell, path: str, ask: Ask, number: int) -> None:
         connection = self.connection
+        self.require_whole(path, ask.message)
         key = self.next_id()
         until = self.node.clock.on_machine(ask.deadline)
         to = connection.names.to_wire(path)
@@ -101,9 +104,10 @@ class Peer:
         Raises:
             BadMessage: it cannot be coded.
         """
-        connection = self.connection
+        connection, message = self.connection, message_in(item)
+        self.require_whole(path, message)
         to = connection.names.to_wire(path)
-        name, body = self._payload(message_in(item))
+        name, body = self._payload(message)
         sender = item.sender if isinstance(item, Item) else None
         source = None if sender is None else connection.names.to_wire(sender.path)
         key, accepted = self.acceptance()
@@ -134,6 +138,15 @@ class Peer:
         self._last_id += 1
         return self._last_id
 
+    def require_whole(self, path: str, message: Any) -> None:
+        """See whether all that a message holds arrives as what it is; one of a kind that was sent before does.
+
+        Raises:
+            BadMessage: a field holds a value of a subclass of what it declares.
+        """
+        if type(message) not in self.kinds_out and (lost := lost_class(message)):
+            raise BadMessage(path, type_name(type(message)), lost)
+
     def _payload(self, message: Any) -> tuple[frames.Name, Any]:
         """Type name and body; a parcel is passed on as it is."""
         kind = type(message)
@@ -143,7 +156,7 @@ class Peer:
         if kind is Parcel:
             return self.connection.names.to_wire(message.name), Raw(message.body)
         name = self.connection.names.to_wire(message_name(kind))
-        if type(name) is int:  # Text introduces the name with this frame: known from the next one on.
+        if type(name) is int and not places(kind):  # Text introduces the name with this frame: known from then on.
             self.kinds_out[kind] = name
         return name, message
 
@@ -379,6 +392,9 @@ class RelayedAsk(Ask, eq=False):
         self.is_over = True
         connection = self.peer.connection
         try:
+            kind: Any = type(self.message)
+            if lost := lost_from(reply_type(kind), reply):
+                raise BadMessage("", type_name(type(reply)), lost)
             connection.send(frames.Reply(self.id, cast("Any", reply)))
         except BadMessage as error:
             self.is_over = False
@@ -393,13 +409,7 @@ class RelayedAsk(Ask, eq=False):
     def fail(self, error: BaseException) -> None:
         if not self.is_over:
             self.tell_failure(error)
-        codec = self.peer.codec
-        try:
-            kind, name, body = codec.encode_error(error)
-        except BadMessage as bad:  # A Refusal with a field that cannot be sent is a reply that cannot.
-            why = f"{type_name(type(error))}: {bad.problem}"
-            kind, name, body = codec.encode_error(BadReply(*asked(self), why))
-        self.fail_raw(kind, name, body)
+        self.fail_raw(*self.peer.codec.encode_error(error, *asked(self)))
 
     def fail_raw(self, kind: str, name: str, body: bytes) -> None:
         """Pass an encoded error on."""

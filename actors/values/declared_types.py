@@ -1,0 +1,183 @@
+"""What the declared types of a message say of its values: where an order has to be made, and where a class gets lost.
+
+A value is decoded as what its field declares. One of a subclass would come out as its base, without what is its own.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, Final
+
+import msgspec
+from msgspec import inspect
+
+from ..errors import shown, type_name
+from ..exit_reasons import ExitReason
+
+CLASSES: Final = (inspect.StructType, inspect.DataclassType)
+"""Of these a value may be of a subclass, with fields of its own."""
+FIELDS: Final = (*CLASSES, inspect.NamedTupleType)
+ITEMS: Final = (inspect.ListType, inspect.SetType, inspect.FrozenSetType, inspect.VarTupleType, inspect.CollectionType)
+
+
+def _parts(info: inspect.Type) -> Iterator[inspect.Type]:
+    """All types that a declared one is made of, itself first, each once."""
+    waiting: list[Any] = [info]
+    seen: set[int] = set()
+    while waiting:
+        part = waiting.pop()
+        if isinstance(part, (inspect.Type, inspect.Field)) and id(part) not in seen:
+            seen.add(id(part))
+            waiting.extend(getattr(part, name) for name in part.__struct_fields__)
+            if isinstance(part, inspect.Type):
+                yield part
+        elif isinstance(part, tuple):
+            waiting.extend(part)
+
+
+def _described(declared: Any) -> inspect.Type:
+    try:
+        return inspect.type_info(declared)
+    except Exception:  # It is no type that a payload is decoded as: the codec says so, in its own words.
+        return inspect.AnyType()
+
+
+def _holds_set(declared: Any) -> bool:
+    """Whether there is a set somewhere in what this type declares.
+
+    >>> holds_set(dict[str, list[frozenset[str]]]), holds_set(dict[str, float]), holds_set(Any), holds_set(set)
+    (True, False, False, True)
+    """
+    return any(isinstance(part, (inspect.SetType, inspect.FrozenSetType)) for part in _parts(_described(declared)))
+
+
+holds_set: Callable[[Any], bool] = functools.cache(_holds_set)
+"""Whether there is a set somewhere in what a type declares."""
+
+
+# -- classes that would get lost ------------------------------------------------------------------------------------
+
+Place = tuple[str, inspect.Type, tuple[type, ...]]
+"""A field, what it declares, and the classes that its values and their parts may be declared to be of."""
+
+
+def _place(name: str, info: inspect.Type) -> Place:
+    return name, info, tuple({origin_of(part.cls): None for part in _parts(info) if isinstance(part, CLASSES)})
+
+
+def origin_of(cls: Any) -> type:
+    """The class itself of a generic one with its parameters."""
+    return getattr(cls, "__origin__", cls)  # type: ignore[no-any-return]
+
+
+def _find_places(kind: Any) -> tuple[Place, ...]:
+    info = _described(kind)
+    fields = info.fields if isinstance(info, FIELDS) else ()
+    places = (_place(field.name, field.type) for field in fields)
+    return tuple(place for place in places if place[2])
+
+
+places: Callable[[Any], tuple[Place, ...]] = functools.cache(_find_places)
+"""The fields of a message class in which a class can get lost: those that declare one. Most messages have none."""
+
+
+def _find_whole(declared: Any) -> Place:
+    return _place("", _described(declared))
+
+
+_whole: Callable[[Any], Place] = functools.cache(_find_whole)
+
+
+def lost_class(message: Any) -> str:
+    """Say which class would get lost of a message, and where; "" if none would.
+
+    >>> class Shape(msgspec.Struct):
+    ...     name: str
+    >>> class Circle(Shape):
+    ...     radius: float
+    >>> class Draw(msgspec.Struct):
+    ...     shapes: list[Shape]
+    >>> lost_class(Draw([Shape("a")]))
+    ''
+    >>> lost_class(Draw([Shape("a"), Circle("b", 2.5)])).split(",")[0].replace(__name__ + ".", "")
+    "field 'shapes[1]': a Circle is given where Shape is declared"
+    """
+    for name, info, classes in places(type(message)):
+        if any(cls.__subclasses__() for cls in classes):
+            path, _, what = _lost(info, getattr(message, name)).partition("\0")
+            if what:
+                return f"field {name + path!r}: {what}"
+    return ""
+
+
+def lost_from(declared: Any, value: Any) -> str:
+    """Say which class would get lost of a value that is decoded as `declared`, and where; "" if none would."""
+    _, info, classes = _whole(declared)
+    if not any(cls.__subclasses__() for cls in classes):
+        return ""
+    path, _, what = _lost(info, value).partition("\0")
+    return f"at {path.removeprefix('.')!r}: {what}" if path else what
+
+
+def _lost(info: inspect.Type, value: Any) -> str:
+    """What gets lost, behind the path to it and a NUL; "" if nothing does, or if the value is none of this type."""
+    if isinstance(info, inspect.UnionType):
+        return _lost_in_union(info, value)
+    if isinstance(info, FIELDS):
+        cls = origin_of(info.cls)
+        if not isinstance(value, cls):
+            return ""
+        if type(value) is not cls and isinstance(info, CLASSES):
+            return f"\0{_told(type(value), cls)}"
+        for field in info.fields:
+            if found := _lost(field.type, getattr(value, field.name)):
+                return f".{field.name}{found}"
+        return ""
+    if isinstance(info, inspect.DictType):
+        entries = value.items() if isinstance(value, dict) else ()
+        for key, part in entries:
+            if found := _lost(info.key_type, key) or _lost(info.value_type, part):
+                return f"[{shown(key)}]{found}"
+        return ""
+    if isinstance(info, inspect.TypedDictType):
+        for field in info.fields if isinstance(value, dict) else ():
+            if field.name in value and (found := _lost(field.type, value[field.name])):
+                return f"[{field.name!r}]{found}"
+        return ""
+    types: Iterable[inspect.Type] = ()
+    if isinstance(info, ITEMS):
+        types = itertools.repeat(info.item_type)
+    elif isinstance(info, inspect.TupleType):
+        types = info.item_types
+    parts = value if isinstance(value, (list, tuple, set, frozenset)) else ()
+    for place, (one, part) in enumerate(zip(types, parts, strict=False)):
+        if found := _lost(one, part):
+            return f"[{place}]{found}"
+    return ""
+
+
+def _lost_in_union(info: inspect.UnionType, value: Any) -> str:
+    """As `_lost`: what a value is itself counts before what it descends from."""
+    first = ""
+    for one in info.types:
+        if isinstance(one, FIELDS) and type(value) is origin_of(one.cls):
+            return _lost(one, value)
+        first = first or _lost(one, value)
+    return first
+
+
+def _told(given: type, declared: type) -> str:
+    return (
+        f"a {type_name(given)} is given where {type_name(declared)} is declared, and would arrive as that, without "
+        f"what is its own; {_hint(declared)}"
+    )
+
+
+def _hint(declared: type) -> str:
+    if issubclass(declared, ExitReason):
+        return "send what matters of it: str(reason) says why, reason.is_clean whether in good order"
+    if issubclass(declared, msgspec.Struct):
+        return f"declare the classes that may come, as in A | B, each with tag=True, in place of {declared.__name__}"
+    return "declare the class itself, or make them structs with tag=True and declare those that may come, as in A | B"
