@@ -186,10 +186,9 @@ class Codec:
                 kind = cell.table.kind_named(name)
             except UnknownMessage as error:
                 raise UnknownMessage(cell.path, error.message) from None
-        decode = self._decoders.get(kind) or self.decoder(kind)
         try:
-            return decode(body)
-        except Exception as error:
+            return (self._decoders.get(kind) or self.decoder(kind))(body)
+        except Exception as error:  # Of a class whose fields nothing can be decoded as, too.
             raise BadMessage(cell.path, name.replace(":", "."), misfit(kind, decode_error(error))) from error
 
     def opened(self, cell: Cell, message: object) -> object:
@@ -313,10 +312,27 @@ def alike(value: Any) -> Any:
     return made
 
 
-def encode_array(array: Any) -> bytes:
-    """dtype, shape and the elements in C order, in one copy."""
+def check_array(array: Any) -> None:
+    """See whether an array arrives as what it is.
+
+    Raises:
+        TypeError: it has objects in it, or is of a class of its own; one on a file arrives as what is in it.
+    """
+    import numpy as np
+
     if array.dtype.hasobject:
         raise TypeError("a numpy array of objects cannot be sent")
+    kind = type(array)
+    if kind is np.ndarray or kind is np.memmap:
+        return
+    if issubclass(kind, np.ma.MaskedArray):
+        raise TypeError("a masked array would arrive without its mask; send its data and its mask, as two arrays")
+    raise TypeError(f"a {type_name(kind)} would arrive as a plain array; send numpy.asarray(...) of it")
+
+
+def encode_array(array: Any) -> bytes:
+    """dtype, shape and the elements in C order, in one copy."""
+    check_array(array)
     elements = array.reshape(-1).view("u1") if array.flags.c_contiguous else array.tobytes()
     return b"".join((array_head(array), elements))
 

@@ -16,9 +16,8 @@ from msgspec import inspect
 from ..errors import shown, type_name
 from ..exit_reasons import ExitReason
 
-CLASSES: Final = (inspect.StructType, inspect.DataclassType)
-"""Of these a value may be of a subclass, with fields of its own."""
-FIELDS: Final = (*CLASSES, inspect.NamedTupleType)
+CLASSES: Final = (inspect.StructType, inspect.DataclassType, inspect.NamedTupleType)
+"""Of these a value may be of a subclass, with fields and methods of its own."""
 ITEMS: Final = (inspect.ListType, inspect.SetType, inspect.FrozenSetType, inspect.VarTupleType, inspect.CollectionType)
 
 
@@ -60,11 +59,19 @@ holds_set: Callable[[Any], bool] = functools.cache(_holds_set)
 # -- classes that would get lost ------------------------------------------------------------------------------------
 
 Place = tuple[str, inspect.Type, tuple[type, ...]]
-"""A field, what it declares, and the classes that its values and their parts may be declared to be of."""
+"""A field, what it declares, and the classes that its values and their parts may be declared to be of.
+
+Something can get lost where one of them has a subclass; a dict whose keys are declared may have more of them.
+"""
 
 
 def _place(name: str, info: inspect.Type) -> Place:
-    return name, info, tuple({origin_of(part.cls): None for part in _parts(info) if isinstance(part, CLASSES)})
+    parts = [part for part in _parts(info) if isinstance(part, (*CLASSES, inspect.TypedDictType))]
+    return name, info, tuple({origin_of(part.cls): None for part in parts})
+
+
+def _may_lose(classes: tuple[type, ...]) -> bool:
+    return any(issubclass(cls, dict) or cls.__subclasses__() for cls in classes)
 
 
 def origin_of(cls: Any) -> type:
@@ -74,13 +81,13 @@ def origin_of(cls: Any) -> type:
 
 def _find_places(kind: Any) -> tuple[Place, ...]:
     info = _described(kind)
-    fields = info.fields if isinstance(info, FIELDS) else ()
+    fields = info.fields if isinstance(info, CLASSES) else ()
     places = (_place(field.name, field.type) for field in fields)
     return tuple(place for place in places if place[2])
 
 
 places: Callable[[Any], tuple[Place, ...]] = functools.cache(_find_places)
-"""The fields of a message class in which a class can get lost: those that declare one. Most messages have none."""
+"""The fields of a message class in which something can get lost: those that declare a class. Most have none."""
 
 
 def _find_whole(declared: Any) -> Place:
@@ -91,7 +98,7 @@ _whole: Callable[[Any], Place] = functools.cache(_find_whole)
 
 
 def lost_class(message: Any) -> str:
-    """Say which class would get lost of a message, and where; "" if none would.
+    """Say which class or key would get lost of a message, and where; "" if none would.
 
     >>> class Shape(msgspec.Struct):
     ...     name: str
@@ -105,7 +112,7 @@ def lost_class(message: Any) -> str:
     "field 'shapes[1]': a Circle is given where Shape is declared"
     """
     for name, info, classes in places(type(message)):
-        if any(cls.__subclasses__() for cls in classes):
+        if _may_lose(classes):
             path, _, what = _lost(info, getattr(message, name)).partition("\0")
             if what:
                 return f"field {name + path!r}: {what}"
@@ -113,9 +120,9 @@ def lost_class(message: Any) -> str:
 
 
 def lost_from(declared: Any, value: Any) -> str:
-    """Say which class would get lost of a value that is decoded as `declared`, and where; "" if none would."""
+    """Say which class or key would get lost of a value that is decoded as `declared`, and where; "" if none would."""
     _, info, classes = _whole(declared)
-    if not any(cls.__subclasses__() for cls in classes):
+    if not _may_lose(classes):
         return ""
     path, _, what = _lost(info, value).partition("\0")
     return f"at {path.removeprefix('.')!r}: {what}" if path else what
@@ -125,11 +132,11 @@ def _lost(info: inspect.Type, value: Any) -> str:
     """What gets lost, behind the path to it and a NUL; "" if nothing does, or if the value is none of this type."""
     if isinstance(info, inspect.UnionType):
         return _lost_in_union(info, value)
-    if isinstance(info, FIELDS):
+    if isinstance(info, CLASSES):
         cls = origin_of(info.cls)
         if not isinstance(value, cls):
             return ""
-        if type(value) is not cls and isinstance(info, CLASSES):
+        if type(value) is not cls:
             return f"\0{_told(type(value), cls)}"
         for field in info.fields:
             if found := _lost(field.type, getattr(value, field.name)):
@@ -142,10 +149,7 @@ def _lost(info: inspect.Type, value: Any) -> str:
                 return f"[{shown(key)}]{found}"
         return ""
     if isinstance(info, inspect.TypedDictType):
-        for field in info.fields if isinstance(value, dict) else ():
-            if field.name in value and (found := _lost(field.type, value[field.name])):
-                return f"[{field.name!r}]{found}"
-        return ""
+        return _lost_in_typed(info, value) if isinstance(value, dict) else ""
     types: Iterable[inspect.Type] = ()
     if isinstance(info, ITEMS):
         types = itertools.repeat(info.item_type)
@@ -158,11 +162,21 @@ def _lost(info: inspect.Type, value: Any) -> str:
     return ""
 
 
+def _lost_in_typed(info: inspect.TypedDictType, value: dict[Any, Any]) -> str:
+    known = {field.name: field.type for field in info.fields}
+    for key, part in value.items():
+        if key not in known:
+            return f"\0the key {shown(key)} is none of those that {type_name(info.cls)} declares, and would get lost"
+        if found := _lost(known[key], part):
+            return f"[{key!r}]{found}"
+    return ""
+
+
 def _lost_in_union(info: inspect.UnionType, value: Any) -> str:
     """As `_lost`: what a value is itself counts before what it descends from."""
     first = ""
     for one in info.types:
-        if isinstance(one, FIELDS) and type(value) is origin_of(one.cls):
+        if isinstance(one, CLASSES) and type(value) is origin_of(one.cls):
             return _lost(one, value)
         first = first or _lost(one, value)
     return first

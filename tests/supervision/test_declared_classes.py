@@ -3,10 +3,12 @@
 It is, wherever a message, reply or refusal is coded: on its way to or from a process, and into a journal.
 """
 
+import enum
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple, TypedDict
 
 import msgspec
+import numpy as np
 import pytest
 
 import holdfast as hf
@@ -32,6 +34,27 @@ class Marked(Row):
     mark: int
 
 
+class Point(NamedTuple):
+    x: int
+    y: int
+
+
+class Named(Point):
+    @property
+    def name(self) -> str:
+        return f"{self.x}/{self.y}"
+
+
+class Options(TypedDict, total=False):
+    width: int
+    corner: Point
+
+
+class Mixed(enum.Enum):
+    NUMBER = 1
+    TEXT = "one"
+
+
 class Square(msgspec.Struct, tag=True):
     side: float
 
@@ -52,6 +75,13 @@ class Draw(hf.Message[str]):
     message: hf.Message[Any] | None = None
     reason: hf.ExitReason | None = None
     union: Square | Dot | None = None
+    point: Point | None = None
+    options: Options | None = None
+    pixels: np.ndarray[Any, Any] | None = None
+
+
+class Choose(hf.Message[None]):
+    one: Mixed
 
 
 class Reply(hf.Message[Shape | list[Row] | None]):
@@ -73,6 +103,9 @@ class Board(hf.Actor):
     @hf.on(Draw)
     async def draw(self, message: Draw) -> str:
         return repr(message)
+
+    @hf.on(Choose)
+    async def choose(self, message: Choose) -> None: ...
 
     @hf.on(Reply)
     async def reply(self, message: Reply) -> Shape | list[Row] | None:
@@ -104,6 +137,7 @@ class Board(hf.Actor):
         return "handed on"
 
 
+MORE: Any = {"width": 1, "height": 2}
 LOST = {
     "a field": (Draw(shape=Circle("a", 2.5)), "field 'shape': a "),
     "an item": (Draw(shapes=[Shape("a"), Circle("b", 2.5)]), "field 'shapes[1]': a "),
@@ -111,13 +145,22 @@ LOST = {
     "a part of a part": (Draw(row=Row("a", [Row("b", [Marked("c", [], 3)])])), "field 'row.below[0].below[0]': a "),
     "another message": (Draw(message=Ping()), "field 'message': a "),
     "an exit reason": (Draw(reason=hf.Shutdown("late")), "str(reason)"),
+    "a named tuple": (Draw(point=Named(1, 2)), "field 'point': a "),
+    "a key": (Draw(options=MORE), "field 'options': the key 'height' is none of"),
+    "a value of a key": (Draw(options={"corner": Named(1, 2)}), "field \"options['corner']\": a "),
+    "a mask": (Draw(pixels=np.ma.masked_array([1, 2], [True, False])), "send its data and its mask"),
+    "a class of arrays": (Draw(pixels=np.zeros(2).view(np.recarray)), "send numpy.asarray(...) of it"),
+    "a large array's class": (Draw(pixels=np.zeros((1, 100_000)).view(np.recarray)), "send numpy.asarray(...) of it"),
 }
 KEPT = (
     Draw(shape=Shape("a")),
     Draw(row=Row("a", [Row("b", [])]), shapes=[Shape("a")]),
     Draw(union=Square(2.0)),
     Draw(union=Dot((1.0, 2.0))),
+    Draw(point=Point(1, 2), options={"width": 1, "corner": Point(1, 2)}),
+    Draw(pixels=np.arange(6).reshape(2, 3).T),
 )
+TOLD = "would (arrive|get lost)"
 CODED = pytest.mark.parametrize(
     ("isolation", "recovery"),
     [("process", None), ("task", hf.hybrid()), ("process", hf.hybrid())],
@@ -141,7 +184,7 @@ async def test_a_message_is_refused_that_would_lose_a_class(
     board = await started(system, isolation, recovery)
     message, told = LOST[what]
     for _ in range(3):  # Of a type that was sent before, too: from the third message on its name is a number.
-        with pytest.raises(BadMessage, match="would arrive as that") as of_tell:
+        with pytest.raises(BadMessage, match=TOLD) as of_tell:
             board.tell(message)
         with pytest.raises(BadMessage) as of_send:
             await board.send(message)
@@ -186,6 +229,17 @@ async def test_an_actor_that_hands_one_on_is_told(
     board = await started(system, isolation, recovery)
     assert "would arrive as that" in await board.ask(Pass(verb, "/app/top/far"))
     assert await board.ask(KEPT[0]) == repr(KEPT[0])
+
+
+@CODED
+async def test_what_nothing_can_be_decoded_as_crashes_nobody(
+    system: hf.ActorSystem, isolation: str, recovery: hf.Method | None
+) -> None:
+    board = await started(system, isolation, recovery)
+    with pytest.raises(BadMessage, match="all str or all int"):
+        await board.ask(Choose(Mixed.TEXT))
+    assert await board.ask(KEPT[0]) == repr(KEPT[0])
+    assert board._cell.life == 1
 
 
 async def test_a_class_that_was_made_later_is_seen(system: hf.ActorSystem) -> None:

@@ -89,7 +89,7 @@ CHECKS = {
     ),
     "a refusal that cannot be sent is a reply that cannot": Check(
         "actors/kernel/codec.py",
-        "            return self._encode_error(BadReply(actor, asked, f\"{type_name(type(error))}: {bad.problem}\"))\n",
+        '            return self._encode_error(BadReply(actor, asked, f"{type_name(type(error))}: {bad.problem}"))\n',
         "            raise bad\n",
         DECLARED,
         "a_reply_is_refused and refusal and recorded",

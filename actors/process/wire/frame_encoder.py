@@ -9,7 +9,7 @@ from typing import Any
 
 import msgspec
 
-from ...kernel.codec import ARRAY, array_head, encode_special
+from ...kernel.codec import ARRAY, array_head, check_array, encode_special
 
 LARGE_ARRAY = 64 * 1024
 """Arrays from this size on are written from where they are instead of being copied into the frame."""
@@ -30,7 +30,8 @@ class FrameEncoder:
         numpy = sys.modules.get("numpy")
         if numpy is None or not isinstance(value, numpy.ndarray) or value.nbytes < LARGE_ARRAY:
             return encode_special(value)
-        if not value.flags.c_contiguous or value.dtype.hasobject:
+        check_array(value)
+        if not value.flags.c_contiguous:
             return encode_special(value)
         mark = next(self._marks).to_bytes(16, "big")
         head = array_head(value)
