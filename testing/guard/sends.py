@@ -24,6 +24,7 @@ from ...actors.kernel.envelope import Ask, ReplyHandle
 from ...actors.kernel.message import Message, message_of, reply_type
 from ...actors.kernel.node import Node
 from ...actors.kernel.ref import ActorRef, current
+from ...actors.values.declared_types import lost_class
 from ..library_code import is_module_of_library
 from ..probes import ProbeActor
 from ..swaps import Swaps
@@ -99,14 +100,15 @@ class SendChecks(TurnWatcher):
         """Look at a message at the moment it is sent.
 
         Raises:
-            BadMessage: a field has another type than it declares.
+            BadMessage: a field has another type than it declares, or one of which the receiver would get less if it had
+                a process of its own.
         """
         kind = type(message)
         if self.reads is not None and not is_of_library(kind):
             self._read(f"{kind.__qualname__} to {cell.path}", message)
         if plain_look(kind)(message) or not isinstance(message, Message) or is_of_library(kind):
             return
-        if not self.are_types_expected and (problem := wrong_field(message)) is not None:
+        if not self.are_types_expected and (problem := wrong_field(message) or lost_class(message)):
             raise BadMessage(cell.path, type_name(kind), problem)
         if is_fixed(kind):
             return

@@ -299,6 +299,7 @@ async def test_may(actor_system):
 
 def test_a_message_of_the_wrong_types_is_refused_where_it_is_sent(suite) -> None:
     result = suite("""
+import msgspec
 @pytest.mark.parametrize("way", ["tell", "ask", "send", "publish"])
 async def test_sends(actor_system, way):
     counter = actor_system.spawn(hf.start(Counter), "counter")
@@ -311,13 +312,32 @@ async def test_sends(actor_system, way):
         else:
             getattr(counter, way)(Add("5"))
 
+class Shape(msgspec.Struct):
+    name: str
+
+class Circle(Shape):
+    radius: float
+
+class Draw(hf.Message):
+    shapes: list[Shape]
+
+class Board(hf.Actor):
+    @hf.on(Draw)
+    async def draw(self, message: Draw) -> None: ...
+
+async def test_what_would_be_less_elsewhere(actor_system):
+    board = actor_system.spawn(hf.start(Board), "board")
+    board.tell(Draw([Shape("a")]))
+    with pytest.raises(hf.errors.BadMessage, match="shapes.0..: a .*Circle is given where .*Shape is declared"):
+        board.tell(Draw([Circle("b", 2.5)]))
+
 async def test_without_the_plugin_nothing_is_checked():
     async with hf.ActorSystem(log=False) as system:
         counter = system.spawn(hf.start(Counter), "counter")
         with pytest.raises(hf.RemoteCrash):
             await counter.ask(Add("5"))
 """)
-    result.assert_outcomes(passed=5)
+    result.assert_outcomes(passed=6)
 
 
 def test_tests_run_under_the_loops_that_are_configured(suite) -> None:
