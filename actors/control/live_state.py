@@ -42,6 +42,15 @@ def attributes(root: object) -> list[tuple[str, Any]]:
     return [*getattr(root, "__dict__", {}).items(), *slots]
 
 
+def set_attribute(holder: object, name: str, value: object, *, is_own: bool) -> None:
+    """Set an attribute that was read; `is_own`: as one of the object itself.
+
+    Such a one is set as it is. What a `__setattr__` of the class does beside that, it has done when it was set first.
+    """
+    own = is_own or name in getattr(holder, "__dict__", ())
+    (object.__setattr__ if own else setattr)(holder, name, value)
+
+
 def _holder(root: object, path: str) -> tuple[Any, str]:
     """What has the variable at a dotted path, and its name there."""
     above, _, name = path.rpartition(".")
@@ -97,11 +106,12 @@ def put_state(actor: Actor, state: Any) -> None:
     if not isinstance(state, dict) or not all(isinstance(name, str) for name in state):
         raise ControlFailed(where, "replace_state", f"the state must be a dict of variables, not {state!r}")
     root = actor._state_root()
+    are_own = actor.key_variables is None
     for name in live_state(actor):
         if name not in state:
-            delattr(*_holder(root, name))
+            (object.__delattr__ if are_own else delattr)(*_holder(root, name))
     for name, value in state.items():
-        setattr(*_holder(root, name), value)
+        set_attribute(*_holder(root, name), value, is_own=are_own)
 
 
 def keeping_variables(actor: Actor, change: Callable[[Any], Any]) -> Callable[[Any], Any]:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
-from ...actors.control.live_state import attributes
+from ...actors.control.live_state import attributes, set_attribute
 from ...actors.errors import type_name
 from ...actors.kernel.actor import Actor
 from ...actors.state_hooks import StateMismatch, as_named_now, migrated, state_getter, state_setter
@@ -140,9 +140,9 @@ def put_back(actor: Actor, saved: Any) -> None:
         return
     if not isinstance(state, dict):
         raise StateMismatch(where, f"its key variables came as {type_name(type(state))}, not as a dict")
-    root = actor._state_root()
+    root, are_named = actor._state_root(), key_names(actor) is not None
     for name, value in state.items():
-        write_path(where, root, name, value)
+        write_path(where, root, name, value, is_own=not are_named)
 
 
 def key_names(actor: Actor) -> tuple[str, ...] | None:
@@ -170,8 +170,8 @@ def read_path(where: str, root: object, path: str) -> Any:
     return value
 
 
-def write_path(where: str, root: object, path: str, value: object) -> None:
-    """Set the variable at a dotted path.
+def write_path(where: str, root: object, path: str, value: object, *, is_own: bool = False) -> None:
+    """Set the variable at a dotted path; `is_own`: it was read as an attribute of the object itself.
 
     Raises:
         StateMismatch: there is nothing to set it on, or it cannot be set.
@@ -179,7 +179,7 @@ def write_path(where: str, root: object, path: str, value: object) -> None:
     above, _, name = path.rpartition(".")
     holder = read_path(where, root, above) if above else root
     try:
-        setattr(holder, name, value)
+        set_attribute(holder, name, value, is_own=is_own)
     except (AttributeError, TypeError) as error:
         raise StateMismatch(where, f"{type_name(type(root))}.{path} cannot be set: {error}") from error
 

@@ -56,9 +56,17 @@ STASH = "tests/system/test_stash_everywhere.py"
 UNCODABLE = "tests/system/test_uncodable.py"
 SHUTDOWN = "tests/supervision/test_shutdown.py"
 WRONG = "tests/system/test_wrong_values.py"
+SETTERS = "tests/checkpoint/test_own_setters.py"
 DECLARED = "tests/supervision/test_declared_classes.py"
 
 CHECKS = {
+    "a state that is put back is set past the setters of the class": Check(
+        "actors/control/live_state.py",
+        "    (object.__setattr__ if own else setattr)(holder, name, value)\n",
+        "    setattr(holder, name, value)\n",
+        SETTERS,
+        "state_is",
+    ),
     "a message does not lose a class on its way to another process": Check(
         "actors/process/wire/peer.py",
         "        if type(message) not in self.kinds_out and (lost := lost_class(message)):\n",
