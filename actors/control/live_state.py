@@ -90,8 +90,13 @@ def state_to_change(actor: Actor) -> Any:
     return _copied(actor, live_state(actor), lambda value: value)
 
 
-def put_state(actor: Actor, state: Any) -> None:
+def put_state(actor: Actor, state: Any, *, is_new: bool = False) -> None:
     """Make `state` the actor's: through `set_state` if the class has `get_state`, else variable by variable.
+
+    Args:
+        actor: whose state.
+        state: what `live_state` would give.
+        is_new: no actor of this class has had it: a `__setattr__` of the class may refuse a variable, and do more.
 
     Raises:
         ControlFailed: it is no state of this actor. Anything else: the class's own code raised.
@@ -106,12 +111,14 @@ def put_state(actor: Actor, state: Any) -> None:
     if not isinstance(state, dict) or not all(isinstance(name, str) for name in state):
         raise ControlFailed(where, "replace_state", f"the state must be a dict of variables, not {state!r}")
     root = actor._state_root()
-    are_own = actor.key_variables is None
     for name in live_state(actor):
         if name not in state:
-            (object.__delattr__ if are_own else delattr)(*_holder(root, name))
+            delattr(*_holder(root, name))
     for name, value in state.items():
-        set_attribute(*_holder(root, name), value, is_own=are_own)
+        if is_new:
+            setattr(*_holder(root, name), value)
+        else:
+            set_attribute(*_holder(root, name), value, is_own=actor.key_variables is None)
 
 
 def keeping_variables(actor: Actor, change: Callable[[Any], Any]) -> Callable[[Any], Any]:
@@ -153,14 +160,19 @@ def _has_default(kind: type, name: str) -> bool:
     return value is not inspect.Parameter.empty and not is_other
 
 
-def change_state(actor: Actor, change: Callable[[Any], Any]) -> None:
+def change_state(actor: Actor, change: Callable[[Any], Any], *, is_new: bool = True) -> None:
     """Put `change(state)` in the place of the state. If anything raises, the state is as before.
+
+    Args:
+        actor: whose state.
+        change: returns the state to be.
+        is_new: not if that is what a trial has come to.
 
     Raises:
         ControlFailed: `change` raised, or what it returned is no state, or cannot be kept.
     """
     with _changing(actor, "replace_state", is_trial=False):
-        put_state(actor, change(state_to_change(actor)))
+        put_state(actor, change(state_to_change(actor)), is_new=is_new)
         actor.ctx._replaced()
 
 
@@ -189,7 +201,7 @@ def tried_state(actor: Actor, changes: Iterable[Callable[[Any], Any]], verb: str
     had = {name for name, _ in attributes(actor)}
     with _changing(actor, verb, is_trial=True):
         for change in changes:
-            put_state(actor, change(state_to_change(actor)))
+            put_state(actor, change(state_to_change(actor)), is_new=True)
         added = {name: value for name, value in attributes(actor) if name not in had}
         return TriedState(state_to_change(actor), actor.ctx._saved(), added, actor.ctx._first_variables)
 

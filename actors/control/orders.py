@@ -369,7 +369,7 @@ def go_on_with(cell: Cell, actor: Actor, prepared: Prepared) -> None:
             actor.ctx._first_variables = prepared.tried.first_variables
         return prepared.tried.state
 
-    change_state(actor, put)
+    change_state(actor, put, is_new=False)
     if start is not None:
         has_become(cell, old, start)
 

@@ -31,9 +31,6 @@ class Journaling(hf.Actor):
         if name == "balance":
             self.past.append(value)
 
-    def __delattr__(self, name: str) -> None:
-        raise AssertionError(f"nobody deletes {name}")
-
     @hf.on(Add)
     async def add(self, message: Add) -> int:
         self.balance += message.n
@@ -78,8 +75,16 @@ async def test_a_moved_state_is_as_it_was(system: hf.ActorSystem) -> None:
     assert await ref.ask(Show()) == "[0, 1, 3] 3"
 
 
-async def test_a_changed_state_is_what_the_change_returned(system: hf.ActorSystem) -> None:
+@pytest.mark.parametrize("in_transaction", [False, True])
+async def test_a_state_that_is_new_is_set_by_the_class_once(system: hf.ActorSystem, in_transaction: bool) -> None:
     ref = await added(system, Journaling)
-    async with asyncio.timeout(30), system.transaction() as change:
-        change.replace_state(ref, lambda state: {**state, "balance": 7})
-    assert await ref.ask(Show()) == "[0, 1, 3] 7"
+    if in_transaction:
+        async with asyncio.timeout(30), system.transaction() as change:
+            change.replace_state(ref, seven)
+    else:
+        await system.replace_state(ref, seven)
+    assert await ref.ask(Show()) == "[0, 1, 3, 7] 7"
+
+
+def seven(state: dict[str, Any]) -> dict[str, Any]:
+    return {**state, "balance": 7}

@@ -65,7 +65,7 @@ CHECKS = {
         "    (object.__setattr__ if own else setattr)(holder, name, value)\n",
         "    setattr(holder, name, value)\n",
         SETTERS,
-        "state_is",
+        "restored_state or moved_state",
     ),
     "a message does not lose a class on its way to another process": Check(
         "actors/process/wire/peer.py",
