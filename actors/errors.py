@@ -386,9 +386,8 @@ DIVERGED = "diverged at turn"
 """In the text of every divergence, and so in the reason of a start that has failed because of one."""
 DIVERGES = (
     "the handler's code or an argument of the constructor was changed, or on_start(True) has changed the state, or the "
-    "handler reads what no snapshot holds (an attribute with a leading underscore that a turn has set, a list or dict in "
-    "the body of the class, which all its actors share, ctx.life, the "
-    "world): use ctx.now(), ctx.random and ctx.uuid(), or set deterministic = False"
+    "handler reads what no snapshot holds (an attribute with a leading underscore that a turn has set, a list or dict "
+    "in the body of the class, which all its actors share, ctx.life, the world): use ctx.now(), ctx.random and ctx.uuid(), or set deterministic = False"
 )
 """Why a replay goes another way."""
 
