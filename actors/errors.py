@@ -387,7 +387,8 @@ DIVERGED = "diverged at turn"
 DIVERGES = (
     "the handler's code or an argument of the constructor was changed, or on_start(True) has changed the state, or the "
     "handler reads what no snapshot holds (an attribute with a leading underscore that a turn has set, a list or dict "
-    "in the body of the class, which all its actors share, ctx.life, the world): use ctx.now(), ctx.random and ctx.uuid(), or set deterministic = False"
+    "in the body of the class, which all its actors share, ctx.life, the world): use ctx.now(), ctx.random "
+    "and ctx.uuid(), or set deterministic = False"
 )
 """Why a replay goes another way."""
 
