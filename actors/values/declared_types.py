@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 import itertools
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import msgspec
 from msgspec import inspect
@@ -58,20 +58,32 @@ holds_set: Callable[[Any], bool] = functools.cache(_holds_set)
 
 # -- classes that would get lost ------------------------------------------------------------------------------------
 
-Place = tuple[str, inspect.Type, tuple[type, ...]]
-"""A field, what it declares, and the classes that its values and their parts may be declared to be of.
 
-Something can get lost where one of them has a subclass; a dict whose keys are declared may have more of them.
-"""
+class Declared(NamedTuple):
+    """A field, or all of a value, as it is declared.
 
+    Attributes:
+        name: the field's; "" for all of a value.
+        info: its type.
+        classes: those that it and its parts may be of. Something can get lost where one of them has a subclass; a dict
+            whose keys are declared may have more of them.
+    """
 
-def _place(name: str, info: inspect.Type) -> Place:
-    parts = [part for part in _parts(info) if isinstance(part, (*CLASSES, inspect.TypedDictType))]
-    return name, info, tuple({origin_of(part.cls): None for part in parts})
+    name: str
+    info: inspect.Type
+    classes: tuple[type, ...]
 
+    @classmethod
+    def of(cls, name: str, info: inspect.Type) -> Declared:
+        """Find the classes in a type."""
+        parts = [part for part in _parts(info) if isinstance(part, (*CLASSES, inspect.TypedDictType))]
+        return cls(name, info, tuple({origin_of(part.cls): None for part in parts}))
 
-def _may_lose(classes: tuple[type, ...]) -> bool:
-    return any(issubclass(cls, dict) or cls.__subclasses__() for cls in classes)
+    def lost(self, value: Any) -> str:
+        """What gets lost of a value, behind the path to it and a NUL; "" if nothing does."""
+        if any(issubclass(kind, dict) or kind.__subclasses__() for kind in self.classes):
+            return _lost(self.info, value)
+        return ""
 
 
 def origin_of(cls: Any) -> type:
@@ -79,22 +91,19 @@ def origin_of(cls: Any) -> type:
     return getattr(cls, "__origin__", cls)  # type: ignore[no-any-return]
 
 
-def _find_places(kind: Any) -> tuple[Place, ...]:
+def _find_class_fields(kind: Any) -> tuple[Declared, ...]:
     info = _described(kind)
-    fields = info.fields if isinstance(info, CLASSES) else ()
-    places = (_place(field.name, field.type) for field in fields)
-    return tuple(place for place in places if place[2])
+    fields = [Declared.of(field.name, field.type) for field in info.fields] if isinstance(info, CLASSES) else []
+    return tuple(field for field in fields if field.classes)
 
 
-places: Callable[[Any], tuple[Place, ...]] = functools.cache(_find_places)
+class_fields: Callable[[Any], tuple[Declared, ...]] = functools.cache(_find_class_fields)
 """The fields of a message class in which something can get lost: those that declare a class. Most have none."""
 
 
-def _find_whole(declared: Any) -> Place:
-    return _place("", _described(declared))
-
-
-_whole: Callable[[Any], Place] = functools.cache(_find_whole)
+@functools.cache
+def _whole(declared: Any) -> Declared:
+    return Declared.of("", _described(declared))
 
 
 def lost_class(message: Any) -> str:
@@ -111,20 +120,16 @@ def lost_class(message: Any) -> str:
     >>> lost_class(Draw([Shape("a"), Circle("b", 2.5)])).split(",")[0].replace(__name__ + ".", "")
     "field 'shapes[1]': a Circle is given where Shape is declared"
     """
-    for name, info, classes in places(type(message)):
-        if _may_lose(classes):
-            path, _, what = _lost(info, getattr(message, name)).partition("\0")
-            if what:
-                return f"field {name + path!r}: {what}"
+    for field in class_fields(type(message)):
+        path, _, what = field.lost(getattr(message, field.name)).partition("\0")
+        if what:
+            return f"field {field.name + path!r}: {what}"
     return ""
 
 
 def lost_from(declared: Any, value: Any) -> str:
     """Say which class or key would get lost of a value that is decoded as `declared`, and where; "" if none would."""
-    _, info, classes = _whole(declared)
-    if not _may_lose(classes):
-        return ""
-    path, _, what = _lost(info, value).partition("\0")
+    path, _, what = _whole(declared).lost(value).partition("\0")
     return f"at {path.removeprefix('.')!r}: {what}" if path else what
 
 

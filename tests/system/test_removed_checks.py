@@ -76,7 +76,7 @@ CHECKS = {
     ),
     "a kind of message that may lose a class is looked at each time": Check(
         "actors/process/wire/peer.py",
-        "        if type(name) is int and not places(kind):",
+        "        if type(name) is int and not class_fields(kind):",
         "        if type(name) is int:",
         DECLARED,
         "a_message_is_refused and field and process",

@@ -20,7 +20,7 @@ from ...kernel.codec import Codec, Parcel, Raw
 from ...kernel.envelope import Ask, Chain, Envelope, Item, chain_of, message_in, waiters
 from ...kernel.lifecycle import NEAR
 from ...kernel.message import Message, message_name, reply_type
-from ...values.declared_types import lost_class, lost_from, places
+from ...values.declared_types import class_fields, lost_class, lost_from
 from . import frames
 from .connection import Connection
 from .frames import BadFrame
@@ -156,7 +156,9 @@ class Peer:
         if kind is Parcel:
             return self.connection.names.to_wire(message.name), Raw(message.body)
         name = self.connection.names.to_wire(message_name(kind))
-        if type(name) is int and not places(kind):  # Text introduces the name with this frame: known from then on.
+        if type(name) is int and not class_fields(
+            kind
+        ):  # Text introduces the name with this frame: known from then on.
             self.kinds_out[kind] = name
         return name, message
 
