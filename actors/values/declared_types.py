@@ -107,19 +107,7 @@ def _whole(declared: Any) -> Declared:
 
 
 def lost_class(message: Any) -> str:
-    """Say which class or key would get lost of a message, and where; "" if none would.
-
-    >>> class Shape(msgspec.Struct):
-    ...     name: str
-    >>> class Circle(Shape):
-    ...     radius: float
-    >>> class Draw(msgspec.Struct):
-    ...     shapes: list[Shape]
-    >>> lost_class(Draw([Shape("a")]))
-    ''
-    >>> lost_class(Draw([Shape("a"), Circle("b", 2.5)])).split(",")[0].replace(__name__ + ".", "")
-    "field 'shapes[1]': a Circle is given where Shape is declared"
-    """
+    """Say which class or key would get lost of a message, and where; "" if none would."""
     for field in class_fields(type(message)):
         path, _, what = field.lost(getattr(message, field.name)).partition("\0")
         if what:
@@ -128,7 +116,15 @@ def lost_class(message: Any) -> str:
 
 
 def lost_from(declared: Any, value: Any) -> str:
-    """Say which class or key would get lost of a value that is decoded as `declared`, and where; "" if none would."""
+    """Say which class or key would get lost of a value that is decoded as `declared`, and where; "" if none would.
+
+    >>> class Shape(msgspec.Struct): ...
+    >>> class Circle(Shape): ...
+    >>> lost_from(list[Shape], [Shape()])
+    ''
+    >>> lost_from(list[Shape], [Shape(), Circle()]).split(",")[0].replace(f"{__name__}.", "")
+    "at '[1]': a Circle is given where Shape is declared"
+    """
     path, _, what = _whole(declared).lost(value).partition("\0")
     return f"at {path.removeprefix('.')!r}: {what}" if path else what
 
