@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 import msgspec
 
 from ..errors import AskTimeout, BadMessage, HoldfastError, SpecError, UnknownMessage, shown, type_name
+from ..values.saved_refs import OneOfItsKind
 from .message import Message, MessageText, Refusal, by_name, message_of
 
 if TYPE_CHECKING:
@@ -311,7 +312,7 @@ async def _finish(cell: Cell, ask: Ask, handler: Coroutine[Any, Any, object]) ->
             ask.answer(reply)
 
 
-class ReplyHandle(Generic[R]):
+class ReplyHandle(OneOfItsKind, Generic[R]):
     """The right to answer one ask later, from `ctx.reply_handle`, for the actor that was asked.
 
     `return self.ctx.reply_handle()` ends the turn without a reply. The actor keeps the handle, in a key variable if it

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from ..events import EndedByLink
 from ..exit_reasons import NOPROC, NORMAL, ExitReason
+from ..values.saved_refs import OneOfItsKind
 from .envelope import LEAVE, Item
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ MADE_UP_NAME: Final = "$"
 """How the names begin of actors that were given none."""
 
 
-class Monitor:
+class Monitor(OneOfItsKind):
     """A handle on one watch over another actor, from `ctx.monitor` or `ctx.watch`, for the actor that watches.
 
     An actor with recovery may keep it in its state.

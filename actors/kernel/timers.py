@@ -6,6 +6,7 @@ import asyncio
 from typing import TYPE_CHECKING, Any
 
 from ..seconds import check_seconds
+from ..values.saved_refs import OneOfItsKind
 from .envelope import Chain, Item
 from .message import Message
 
@@ -13,7 +14,7 @@ if TYPE_CHECKING:
     from .cell import Cell
 
 
-class Timer:
+class Timer(OneOfItsKind):
     """A handle on one timer of an actor, from `ctx.tell_after` or `ctx.every`, for that actor alone.
 
     Without recovery the timer ends with the life that set it; with recovery it runs on, and the handle may be kept in

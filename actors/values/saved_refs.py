@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from typing import NoReturn, Self
 from zlib import crc32
 
 
@@ -14,7 +15,25 @@ def hash_of_address(path: str) -> int:
     return crc32(path.encode("utf-8", "surrogatepass"))
 
 
-class Addressed:
+class OneOfItsKind:
+    """What belongs to a running system: its copy, also the one in a `copy.deepcopy` of what holds it, is itself."""
+
+    __slots__ = ()
+
+    def __copy__(self) -> Self:
+        return self
+
+    def __deepcopy__(self, memo: object) -> Self:
+        return self
+
+    def __reduce_ex__(self, protocol: object) -> NoReturn:
+        raise TypeError(
+            f"{self!r} belongs to a running system and cannot be pickled: keep the address of a ref, `ref.path`, and "
+            f"find it again by `system.ref(path)`"
+        )
+
+
+class Addressed(OneOfItsKind):
     """What stands for the address of an actor: a ref, or what was saved of one."""
 
     __slots__ = ()

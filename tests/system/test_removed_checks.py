@@ -60,6 +60,13 @@ SETTERS = "tests/checkpoint/test_own_setters.py"
 DECLARED = "tests/supervision/test_declared_classes.py"
 
 CHECKS = {
+    "a copy of a ref is the ref": Check(
+        "actors/values/saved_refs.py",
+        "    def __deepcopy__(self, memo: object) -> Self:\n        return self\n",
+        "",
+        "tests/actors/test_copies.py",
+        "what_holds_a_ref",
+    ),
     "a state that is put back is set past the setters of the class": Check(
         "actors/control/live_state.py",
         "    (object.__setattr__ if own else setattr)(holder, name, value)\n",

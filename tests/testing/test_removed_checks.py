@@ -99,10 +99,17 @@ CHECKS = {
     ),
     "types are looked at within containers": Check(
         "testing/guard/sends.py",
-        "        if not self.are_types_expected and (problem := wrong_field(message)) is not None:\n",
-        "        if (problem := None) is not None:\n",
+        "(problem := wrong_field(message) or lost_class(message)):\n",
+        "(problem := lost_class(message)):\n",
         GUARD,
         "test_types_are_looked_at",
+    ),
+    "what would arrive as less elsewhere is looked at": Check(
+        "testing/guard/sends.py",
+        "(problem := wrong_field(message) or lost_class(message)):\n",
+        "(problem := wrong_field(message)):\n",
+        "tests/testing/test_plugin.py",
+        "wrong_types_is_refused",
     ),
     "the class of a message is no struct": Check(
         "testing/guard/declared.py",

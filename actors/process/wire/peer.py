@@ -156,9 +156,8 @@ class Peer:
         if kind is Parcel:
             return self.connection.names.to_wire(message.name), Raw(message.body)
         name = self.connection.names.to_wire(message_name(kind))
-        if type(name) is int and not class_fields(
-            kind
-        ):  # Text introduces the name with this frame: known from then on.
+        # Text introduces the name with this frame: it is known from the next one on.
+        if type(name) is int and not class_fields(kind):
             self.kinds_out[kind] = name
         return name, message
 
