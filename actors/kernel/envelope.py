@@ -15,7 +15,7 @@ import msgspec
 
 from ..errors import AskTimeout, BadMessage, HoldfastError, SpecError, UnknownMessage, shown, type_name
 from ..values.saved_refs import OneOfItsKind
-from .message import Message, MessageText, Refusal, by_name, message_of
+from .message import Message, MessageText, Refusal, descended, message_name, message_of
 
 if TYPE_CHECKING:
     from ..exit_reasons import ExitReason
@@ -127,13 +127,19 @@ class Table(dict[type, Handler]):
         return self[kind] is not unhandled
 
     def kind_named(self, name: str) -> type[Message[Any]]:
-        """The handled message type with this wire name. Raises UnknownMessage."""
+        """The handled message type with this wire name, or one that is loaded and descends from such a type.
+
+        Raises:
+            UnknownMessage: there is none.
+        """
         kind = self.named.get(name)
         if kind is None:
-            kind = by_name(self).get(name)
+            handled = [known for known in self if issubclass(known, Message)]
+            kind = next((one for one in descended(*handled) if message_name(one) == name), None)
             if kind is None:
                 raise UnknownMessage("the actor", name.replace(":", "."))
             self.named[name] = kind
+            self[kind]  # Whoever looks for its handler finds that in the table.
         return kind
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import sys
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator
 from typing import Any, Generic, get_args, get_origin
 
 import msgspec
@@ -19,6 +19,7 @@ from ..errors import BadMessage, HoldfastError, type_name
 from ..values.renamed import NOTED, Renames, former_members
 
 R = TypeVar("R", default=None, covariant=True)
+T = TypeVar("T")
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(msgspec.field,))
@@ -194,15 +195,21 @@ class UnknownRefusal(
 
 def find_refusal(name: str) -> type[Refusal] | None:
     """The loaded refusal class with this wire name."""
-    waiting: list[type[Refusal]] = [Refusal]
+    return next((kind for kind in descended(Refusal) if message_name(kind) == name), None)
+
+
+def descended(*bases: type[T]) -> Iterator[type[T]]:
+    """All loaded classes that are one of these or descend from one, each once.
+
+    >>> class Order(Message): ...
+    >>> class Express(Order): ...
+    >>> [kind.__name__ for kind in descended(Order)]
+    ['Order', 'Express']
+    """
+    waiting, seen = list(bases), set[type[T]]()
     while waiting:
-        kind = waiting.pop()
-        if message_name(kind) == name:
-            return kind
-        waiting.extend(kind.__subclasses__())
-    return None
-
-
-def by_name(kinds: Mapping[type, object]) -> dict[str, type]:
-    """The message types of a handler table by wire name."""
-    return {message_name(kind): kind for kind in kinds if issubclass(kind, Message)}
+        kind = waiting.pop(0)
+        if kind not in seen:
+            seen.add(kind)
+            yield kind
+            waiting.extend(kind.__subclasses__())

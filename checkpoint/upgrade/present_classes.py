@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any, TypeVar
 
 from ...actors.errors import HoldfastError
 from ...actors.kernel.actor import Actor
-from ...actors.kernel.message import Message, Refusal, find_refusal, message_name, reply_type
+from ...actors.kernel.message import Message, Refusal, descended, find_refusal, message_name, reply_type
 from ...actors.process.wire.start_codec import loaded
 from ...actors.values.renamed import former_names
 from ..protocol import MESSAGE, REPLY, TIMED, Answer
@@ -74,11 +73,5 @@ def refusal_called(name: str) -> type[Refusal] | None:
 
 def _renamed(name: str, base: type[T]) -> type[T] | None:
     """The class that says that it had this name; a module that was loaded once more has left others behind."""
-    found = [one for one in _below(base) if name in former_names(one)]
+    found = [one for one in descended(base) if name in former_names(one)]
     return next((one for one in found if loaded(message_name(one), base) is one), found[0] if found else None)
-
-
-def _below(base: type[T]) -> Iterator[type[T]]:
-    for one in base.__subclasses__():
-        yield one
-        yield from _below(one)

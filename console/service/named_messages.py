@@ -8,7 +8,7 @@ import msgspec
 
 from ...actors.errors import BadMessage, SpecError
 from ...actors.kernel.actor import Actor
-from ...actors.kernel.message import Message, message_name
+from ...actors.kernel.message import Message, descended, message_name
 from ...actors.kernel.node import cell_kind
 from ...actors.kernel.ref import ActorRef
 
@@ -79,15 +79,16 @@ def _converted(name: str, value: Any, declared: Any, as_ref: Any) -> Any:
 
 
 def _class_named(ref: ActorRef[Any], name: str) -> type[Message[Any]]:
-    """The class of messages of this name, or `module:Class`, that the actor handles."""
+    """The class of messages of this name, or `module:Class`, that the actor handles; it may descend from one."""
     kind = cell_kind(ref._cell)
     if kind is None or kind is Actor:
         raise SpecError(ref.path, "its class is not known in this process, so no message for it can be made here")
-    known = {message_name(one): one for one in kind._table if issubclass(one, Message)}
+    handled = [one for one in kind._table if issubclass(one, Message)]
+    known = {message_name(one): one for one in descended(*handled)}
     meant = [full for full in known if name in (full, full.partition(":")[2])]
     if len(meant) == 1:
         return known[meant[0]]
-    those = ", ".join(sorted(meant or (full.partition(":")[2] for full in known))) or "nothing"
+    those = ", ".join(sorted(meant or (message_name(one).partition(":")[2] for one in handled))) or "nothing"
     problem = f"it handles several classes {name!r}: say which, of" if meant else f"it does not handle {name!r}, but"
     raise SpecError(ref.path, f"{problem} {those}")
 

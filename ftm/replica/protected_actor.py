@@ -21,7 +21,7 @@ from ...actors.kernel import lifecycle, mailbox
 from ...actors.kernel.actor import Actor
 from ...actors.kernel.cell import DOWN, RUNNING, Cell
 from ...actors.kernel.envelope import Item
-from ...actors.kernel.message import message_name
+from ...actors.kernel.message import descended, message_name
 from ...actors.state_hooks import gives_deltas
 from ...actors.values import encode_value
 from ...checkpoint.life.recorded_inbox import Fed, GoLive, StopRecorded
@@ -179,9 +179,8 @@ class Server(lifecycle.HerePlace):
         state = self.state
         state.has_access = kind.state_access
         state.has_deltas = state.has_access and gives_deltas(kind)
-        state.waiting = frozenset(
-            message_name(one) for one in kind._declared if inspect.iscoroutinefunction(table[one])
-        )
+        known = [one for one in descended(*kind._declared) if inspect.iscoroutinefunction(table[one])]
+        state.waiting = frozenset(map(message_name, known))
 
     def stop(self, cell: Cell, reason: ExitReason) -> None:
         """It ends: by itself, or with the replica. Only one that leads says good-bye."""

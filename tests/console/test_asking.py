@@ -22,6 +22,10 @@ class Far(hf.Message[str]):
     text: str = "nothing"
 
 
+class Farther(Far):
+    by: int = 1
+
+
 class Everything(hf.Message[dict[str, Any]]):
     whole: int
     names: tuple[str, ...]
@@ -122,6 +126,7 @@ async def test_fields_are_json_and_refs_are_addresses(socket: Path) -> None:
     assert await said(socket, "ask", "/app/plain", "Seats") == (0, "{1: 'ann'}")
     assert await said(socket, "ask", "/app/plain", "Seats", "--json") == (0, '{"text": "{1: \'ann\'}"}')
     assert await said(socket, "ask", "/app/plain", "Far", "--json") == (0, '{"reply": "nothing"}')
+    assert await said(socket, "ask", "/app/plain", "Farther", '{"by": 2}') == (0, '"nothing"')
 
 
 async def test_a_supervisor_is_asked_too(socket: Path) -> None:

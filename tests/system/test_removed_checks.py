@@ -60,6 +60,13 @@ SETTERS = "tests/checkpoint/test_own_setters.py"
 DECLARED = "tests/supervision/test_declared_classes.py"
 
 CHECKS = {
+    "a handler takes what derives from its message, also by name": Check(
+        "actors/kernel/envelope.py",
+        "            kind = next((one for one in descended(*handled) if message_name(one) == name), None)\n",
+        "            kind = next((one for one in handled if message_name(one) == name), None)\n",
+        "tests/checkpoint/test_derived_messages.py",
+        "reads_what_derives and process or derives_is_handled and protected",
+    ),
     "a copy of a ref is the ref": Check(
         "actors/values/saved_refs.py",
         "    def __deepcopy__(self, memo: object) -> Self:\n        return self\n",

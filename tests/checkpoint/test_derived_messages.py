@@ -1,0 +1,71 @@
+"""A handler takes what derives from its message, too: wherever its actor lives, and when a journal is read again."""
+
+import asyncio
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import holdfast as hf
+from tests.checkpoint import derived_player
+from tests.checkpoint.derived_player import ORDERS, Express, Ledger, Show
+from tests.launched import kills_itself, python
+
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
+SHOWN = [repr(order) for order in ORDERS]
+PLACES: dict[str, dict[str, Any]] = {
+    "task": {},
+    "process": {"isolation": "process"},
+    "recorded": {"recovery": hf.hybrid()},
+    "recorded process": {"recovery": hf.hybrid(), "isolation": "process"},
+    "protected": {"recovery": hf.hybrid(), "mechanism": hf.ftm.PBR()},
+    "repeated": {"recovery": hf.hybrid(), "mechanism": hf.ftm.TR()},
+}
+
+
+@pytest.mark.parametrize("place", PLACES)
+async def test_what_derives_is_handled(place: str) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        ledger = await system.start(hf.child("ledger", hf.start(Ledger), **PLACES[place]))
+        for number, order in enumerate(ORDERS, 1):
+            assert await ledger.ask(order) == number
+        assert await ledger.ask(Show()) == SHOWN
+        ledger.tell(ORDERS[1])
+        await ledger.send(ORDERS[2])
+        assert await ledger.ask(Show()) == [*SHOWN, *SHOWN[1:]]
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_what_derives_moves_in_the_mailbox(isolation: Any) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        ledger = await system.start(hf.child("ledger", hf.start(Ledger), isolation=isolation))
+        await system.suspend(ledger)
+        for order in ORDERS:
+            ledger.tell(order)
+        await system.set_isolation(ledger, "process" if isolation == "task" else "task")
+        await system.resume(ledger)
+        assert await ledger.ask(Show()) == SHOWN
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_the_next_program_reads_what_derives(isolation: str, tmp_path: Path) -> None:
+    store = tmp_path / "app.db"
+    await kills_itself(derived_player.__file__, store, isolation, "killed")
+    again = await python(derived_player.__file__, store, isolation, "read")
+    assert again.returncode == 0, again.stderr
+    assert json.loads(again.stdout) == SHOWN
+
+
+async def test_what_is_of_no_class_that_is_handled_is_refused() -> None:
+    class Strange(hf.Message[int]):
+        number: int
+
+    async with hf.ActorSystem("app", log=False) as system:
+        ledger = await system.start(hf.child("ledger", hf.start(Ledger), isolation="process"))
+        await ledger.ask(ORDERS[1])
+        strange: Any = Strange(1)
+        with pytest.raises(hf.UnknownMessage, match="Strange"):
+            await ledger.ask(strange)
+        await asyncio.wait_for(ledger.ask(Express(4, "sea")), 10)
