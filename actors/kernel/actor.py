@@ -178,12 +178,19 @@ class Actor:
         if inspect.iscoroutinefunction(cls.__init__):
             raise TypeError(f"{type_name(cls)}.__init__ cannot be async: what has to be awaited goes into on_start")
         table, declared, topics = Table(), dict[type, Handles](), list[str]()
-        members = dict[str, Any]()
+        members, marked = dict[str, Any](), dict[str, tuple[Handles, ...]]()
         for one in reversed(cls.__mro__):
             members.update(vars(one))
+            marked.update((name, marks) for name, value in vars(one).items() if (marks := handled_by(value)))
         for name in sorted(members):
             handler = members[name]
             marks, subscribed = handled_by(handler), _topics_of(handler)
+            if not marks and name in marked and handler is not None:
+                lost = " and ".join(f"@on({handles.kind.__name__})" for handles in marked[name])
+                raise TypeError(
+                    f"{type_name(cls)}.{name} stands in the place of a handler and is none: write {lost} above it, "
+                    f"too, or `{name} = None` if nothing is to handle that"
+                )
             for handles in marks:
                 if not any(vars(one).get(name) is handler for one in cls.__mro__[1:] if issubclass(one, Actor)):
                     _check(cls, name, handler, handles.kind)  # Else it was when the base was made; this is slow.

@@ -77,6 +77,20 @@ async def test_a_derived_actor_inherits_and_overrides_handlers(system: hf.ActorS
     assert await overriding.ask(Read()) == 5
 
 
+@pytest.mark.parametrize("base", [Counter, type("Mixin", (), {"add": Counter.add})], ids=["an actor", "a mixin"])
+def test_what_stands_in_the_place_of_a_handler_is_one_or_says_that_there_is_none(base: type) -> None:
+    bases = (base,) if issubclass(base, hf.Actor) else (base, hf.Actor)
+
+    def add(self: object, message: Add) -> int:
+        return -1
+
+    with pytest.raises(TypeError, match=r"Silent.add stands in the place of a handler.*write @on\(Add\) above it, too"):
+        type("Silent", bases, {"add": add})
+    with pytest.raises(TypeError, match=r"Silent\.add stands in the place of a handler"):
+        type("Silent", (type("Above", (), {"add": add}), *bases), {})
+    assert Add not in type("Without", bases, {"add": None})._table
+
+
 async def test_a_message_without_handler_is_refused_at_the_call_every_time(system: hf.ActorSystem) -> None:
     counter = system.spawn(hf.start(Counter))
     for _ in range(2):

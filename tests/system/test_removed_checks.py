@@ -60,6 +60,13 @@ SETTERS = "tests/checkpoint/test_own_setters.py"
 DECLARED = "tests/supervision/test_declared_classes.py"
 
 CHECKS = {
+    "what stands in the place of a handler is one": Check(
+        "actors/kernel/actor.py",
+        "            if not marks and name in marked and handler is not None:\n",
+        "            if False:\n",
+        "tests/actors/test_actor.py",
+        "stands_in_the_place",
+    ),
     "a handler takes what derives from its message, also by name": Check(
         "actors/kernel/envelope.py",
         "            kind = next((one for one in descended(*handled) if message_name(one) == name), None)\n",
