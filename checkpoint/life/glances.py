@@ -6,9 +6,8 @@ import types
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from ...actors.errors import type_name
 from ...actors.kernel.envelope import ReplyHandle
-from ...actors.kernel.message import Message, Refusal, reply_type
+from ...actors.kernel.message import Message, Refusal
 from ...actors.kernel.ref import current
 from ..protocol import Answer, Feed, Glanced
 from .recorded_inbox import Fed
@@ -116,7 +115,7 @@ def _answered(life: Life, feed: Feed) -> Answer:
         return life.answer_error(no)
     if isinstance(result, ReplyHandle):
         raise NeedsTurn
-    return life.answer_value(result, reply_type(type(message)), type_name(type(message)))
+    return life.answer_reply(result, type(message))
 
 
 def _returned(running: types.CoroutineType[Any, Any, Any]) -> Any:

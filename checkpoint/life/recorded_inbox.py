@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from ...actors.errors import HoldfastError, RemoteCrash, StartFailed, type_name
+from ...actors.errors import HoldfastError, RemoteCrash, StartFailed
 from ...actors.exit_reasons import NORMAL, ExitReason, recorded_exit
 from ...actors.kernel import lifecycle
 from ...actors.kernel.actor import Actor
 from ...actors.kernel.cell import Cell
 from ...actors.kernel.envelope import LEAVE, Chain, Item, ReplyHandle
-from ...actors.kernel.message import Message, Refusal, reply_type
+from ...actors.kernel.message import Refusal
 from ..protocol import CRASH, DROPPED, LATER, NO_ANSWER, OK, START, STASHED, Answer, Feed, Go
 from ..snapshot.key_variables import check_saved
 
@@ -124,8 +124,7 @@ class Fed(Item, msgspec.Struct, eq=False):
         """What the handler has returned, as whoever has asked gets it."""
         if isinstance(result, ReplyHandle):
             return Answer(LATER)
-        kind: type[Message[Any]] = type(self.message)
-        answer: Answer = self.life.answer_value(result, reply_type(kind), type_name(kind))
+        answer: Answer = self.life.answer_reply(result, type(self.message))
         return answer
 
     def end(self, answer: Answer) -> None:

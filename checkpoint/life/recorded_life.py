@@ -31,7 +31,7 @@ from ...actors.kernel import lifecycle, mailbox
 from ...actors.kernel.actor import Actor, Start
 from ...actors.kernel.cell import DOWN, RUNNING, Cell
 from ...actors.kernel.envelope import Item
-from ...actors.kernel.message import message_name
+from ...actors.kernel.message import Message, message_name, reply_type
 from ...actors.kernel.node import cell_kind
 from ...actors.persistence import UNFIT
 from ...actors.state_hooks import StateMismatch, state_getter
@@ -498,6 +498,14 @@ class Life:
         """An error as the asker will get it."""
         asked = "what it was asked" if self.feed is None else self.feed.name.replace(":", ".")
         return Answer(*self.cell.node.codec.encode_error(error, self.cell.path, asked))
+
+    def answer_reply(self, value: object, kind: type[Message[Any]]) -> Answer:
+        """A reply to a message of this type as the asker will get it; one that cannot be coded becomes an error."""
+        asked = type_name(kind)
+        try:
+            return self.answer_value(value, reply_type(kind), asked)
+        except TypeError as error:  # A name in the type of the reply is not known in the module of the message.
+            return self.answer_error(BadReply(self.cell.path, asked, str(error)))
 
     def answer_value(self, value: object, declared: Any, asked: str) -> Answer:
         """A reply to a message of type `asked` as the asker will get it; one that cannot be coded becomes an error."""

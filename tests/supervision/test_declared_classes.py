@@ -84,6 +84,10 @@ class Choose(hf.Message[None]):
     one: Mixed
 
 
+class Unknown(hf.Message["Nobody"]):  # type: ignore[name-defined]  # that is the point
+    """Its reply has a type that its module does not know, as one that is imported for type checkers only."""
+
+
 class Reply(hf.Message[Shape | list[Row] | None]):
     what: str
 
@@ -103,6 +107,10 @@ class Board(hf.Actor):
     @hf.on(Draw)
     async def draw(self, message: Draw) -> str:
         return repr(message)
+
+    @hf.on(Unknown)
+    async def unknown(self, message: Unknown) -> Any:
+        return 1
 
     @hf.on(Choose)
     async def choose(self, message: Choose) -> None: ...
@@ -238,6 +246,8 @@ async def test_what_nothing_can_be_decoded_as_crashes_nobody(
     board = await started(system, isolation, recovery)
     with pytest.raises(BadMessage, match="all str or all int"):
         await board.ask(Choose(Mixed.TEXT))
+    with pytest.raises(BadReply, match="reply type 'Nobody'"):
+        await board.ask(Unknown())
     assert await board.ask(KEPT[0]) == repr(KEPT[0])
     assert board._cell.life == 1
 

@@ -392,14 +392,14 @@ class RelayedAsk(Ask, eq=False):
             return
         self.is_over = True
         connection = self.peer.connection
+        kind: Any = type(self.message)
         try:
-            kind: Any = type(self.message)
             if lost := lost_from(reply_type(kind), reply):
                 raise BadMessage("", type_name(type(reply)), lost)
             connection.send(frames.Reply(self.id, cast("Any", reply)))
-        except BadMessage as error:
+        except (BadMessage, TypeError) as error:  # A name in the type of the reply may not be known in its module.
             self.is_over = False
-            self.fail(BadReply(*asked(self), error.problem))
+            self.fail(BadReply(*asked(self), error.problem if isinstance(error, BadMessage) else str(error)))
 
     def answer_raw(self, body: bytes) -> None:
         """Pass an encoded reply on."""
