@@ -185,11 +185,11 @@ class Codec:
             try:
                 kind = cell.table.kind_named(name)
             except UnknownMessage as error:
-                raise UnknownMessage(cell.path, error.message) from None
+                raise UnknownMessage(known_at(cell), error.message) from None
         try:
             return (self._decoders.get(kind) or self.decoder(kind))(body)
         except Exception as error:  # Of a class whose fields nothing can be decoded as, too.
-            raise BadMessage(cell.path, name.replace(":", "."), misfit(kind, decode_error(error))) from error
+            raise BadMessage(known_at(cell), name.replace(":", "."), misfit(kind, decode_error(error))) from error
 
     def opened(self, cell: Cell, message: object) -> object:
         """A message for a cell, decoded if it is still packed; as it is if the cell's class does not know its type."""
@@ -264,6 +264,11 @@ class Codec:
         if kind == "crash":
             return RemoteCrash(*args)
         return rebuild_error(name, args) or AskFailed(name, ", ".join(map(str, args)))
+
+
+def known_at(cell: Cell) -> str:
+    """Where others know the actor of a cell to be: a protected one does not live there itself."""
+    return cell.path if cell.actor is None else cell.actor.ctx.path
 
 
 def decode_error(error: Exception) -> msgspec.MsgspecError:

@@ -30,6 +30,7 @@ from ...actors.exit_reasons import ExitReason
 from ...actors.kernel import lifecycle, mailbox
 from ...actors.kernel.actor import Actor, Start
 from ...actors.kernel.cell import DOWN, RUNNING, Cell
+from ...actors.kernel.codec import known_at
 from ...actors.kernel.envelope import Item
 from ...actors.kernel.message import Message, message_name, reply_type
 from ...actors.kernel.node import cell_kind
@@ -497,7 +498,7 @@ class Life:
     def answer_error(self, error: BaseException) -> Answer:
         """An error as the asker will get it."""
         asked = "what it was asked" if self.feed is None else self.feed.name.replace(":", ".")
-        return Answer(*self.cell.node.codec.encode_error(error, self.cell.path, asked))
+        return Answer(*self.cell.node.codec.encode_error(error, known_at(self.cell), asked))
 
     def answer_reply(self, value: object, kind: type[Message[Any]]) -> Answer:
         """A reply to a message of this type as the asker will get it; one that cannot be coded becomes an error."""
@@ -505,14 +506,14 @@ class Life:
         try:
             return self.answer_value(value, reply_type(kind), asked)
         except TypeError as error:  # A name in the type of the reply is not known in the module of the message.
-            return self.answer_error(BadReply(self.cell.path, asked, str(error)))
+            return self.answer_error(BadReply(known_at(self.cell), asked, str(error)))
 
     def answer_value(self, value: object, declared: Any, asked: str) -> Answer:
         """A reply to a message of type `asked` as the asker will get it; one that cannot be coded becomes an error."""
         try:
-            return Answer(REPLY, "", self.cell.node.codec.encode_alike(value, self.cell.path, declared))
+            return Answer(REPLY, "", self.cell.node.codec.encode_alike(value, known_at(self.cell), declared))
         except BadMessage as error:
-            return self.answer_error(BadReply(self.cell.path, asked, error.problem))
+            return self.answer_error(BadReply(known_at(self.cell), asked, error.problem))
 
     def put(
         self, verb: str, to: str, name: str = "", body: bytes = b"", *, seconds: float = 0.0, interval: float = 0.0

@@ -88,7 +88,8 @@ def test_what_stands_in_the_place_of_a_handler_is_one_or_says_that_there_is_none
         type("Silent", bases, {"add": add})
     with pytest.raises(TypeError, match=r"Silent\.add stands in the place of a handler"):
         type("Silent", (type("Above", (), {"add": add}), *bases), {})
-    assert Add not in type("Without", bases, {"add": None})._table
+    without: Any = type("Without", bases, {"add": None})
+    assert Add not in without._table
 
 
 async def test_a_message_without_handler_is_refused_at_the_call_every_time(system: hf.ActorSystem) -> None:

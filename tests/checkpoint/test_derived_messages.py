@@ -3,7 +3,7 @@
 import asyncio
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
@@ -58,14 +58,18 @@ async def test_the_next_program_reads_what_derives(isolation: str, tmp_path: Pat
     assert json.loads(again.stdout) == SHOWN
 
 
-async def test_what_is_of_no_class_that_is_handled_is_refused() -> None:
+@pytest.mark.parametrize("place", PLACES)
+async def test_what_is_of_no_class_that_is_handled_is_refused(place: str) -> None:
     class Strange(hf.Message[int]):
         number: int
 
     async with hf.ActorSystem("app", log=False) as system:
-        ledger = await system.start(hf.child("ledger", hf.start(Ledger), isolation="process"))
+        ledger = await system.start(hf.child("ledger", hf.start(Ledger), **PLACES[place]))
         await ledger.ask(ORDERS[1])
-        strange: Any = Strange(1)
-        with pytest.raises(hf.UnknownMessage, match="Strange"):
+        strange, wrong = cast("Any", Strange(1)), Express(cast("Any", "two"), "air")
+        with pytest.raises(hf.UnknownMessage, match="^/app/ledger has no handler for .*Strange"):
             await ledger.ask(strange)
+        if place != "task":
+            with pytest.raises(hf.errors.BadMessage, match=r"Express to /app/ledger: Expected `int`, got `str`"):
+                await ledger.ask(wrong)
         await asyncio.wait_for(ledger.ask(Express(4, "sea")), 10)
