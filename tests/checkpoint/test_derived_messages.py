@@ -67,7 +67,7 @@ async def test_what_is_of_no_class_that_is_handled_is_refused(place: str) -> Non
         ledger = await system.start(hf.child("ledger", hf.start(Ledger), **PLACES[place]))
         await ledger.ask(ORDERS[1])
         strange, wrong = cast("Any", Strange(1)), Express(cast("Any", "two"), "air")
-        with pytest.raises(hf.UnknownMessage, match="^/app/ledger has no handler for .*Strange"):
+        with pytest.raises(hf.UnknownMessage, match=r"^/app/ledger has no handler for .*Strange"):
             await ledger.ask(strange)
         if place != "task":
             with pytest.raises(hf.errors.BadMessage, match=r"Express to /app/ledger: Expected `int`, got `str`"):
