@@ -30,7 +30,7 @@ from ..errors import (
     type_name,
 )
 from ..values.arrays import described_dtype
-from ..values.declared_types import holds_set, lost_class, lost_from
+from ..values.declared_types import class_fields, holds_set, lost_from
 from .cell import GONE
 from .envelope import ReplyHandle, refuse
 from .message import Message, Refusal, RuntimeCall, UnknownRefusal, find_refusal, message_name, reply_type
@@ -107,7 +107,8 @@ class Codec:
             BadMessage: naming the type and what in it cannot be coded or would get lost, or that it is too large.
         """
         try:
-            if lost := lost_class(value) if declared is None else lost_from(declared, value):
+            # Most messages declare no class; this is done for each.
+            if (declared is not None or class_fields(type(value))) and (lost := lost_from(declared, value)):
                 raise TypeError(lost)
             body = self.encoder.encode(value)
         except Exception as error:  # msgspec raises what a hook or a field's own code raises: all means "not codable".

@@ -118,6 +118,8 @@ def lost_class(message: Any) -> str:
 def lost_from(declared: Any, value: Any) -> str:
     """Say which class or key would get lost of a value that is decoded as `declared`, and where; "" if none would.
 
+    Without a type (None) it is a message, which is decoded as what it is.
+
     >>> class Shape(msgspec.Struct): ...
     >>> class Circle(Shape): ...
     >>> lost_from(list[Shape], [Shape()])
@@ -125,6 +127,8 @@ def lost_from(declared: Any, value: Any) -> str:
     >>> lost_from(list[Shape], [Shape(), Circle()]).split(",")[0].replace(f"{__name__}.", "")
     "at '[1]': a Circle is given where Shape is declared"
     """
+    if declared is None:
+        return lost_class(value)
     path, _, what = _whole(declared).lost(value).partition("\0")
     return f"at {path.removeprefix('.')!r}: {what}" if path else what
 

@@ -111,8 +111,8 @@ CHECKS = {
     ),
     "no message, reply or refusal loses a class in a journal": Check(
         "actors/kernel/codec.py",
-        "            if lost := lost_class(value) if declared is None else lost_from(declared, value):\n",
-        "            if lost := lost_class(None):\n",
+        "            if (declared is not None or class_fields(type(value))) and (lost := lost_from(declared, value))",
+        "            if (lost := lost_from(None, None))",
         DECLARED,
         "a_message_is_refused and recorded",
     ),
