@@ -231,11 +231,12 @@ class Codec:
         One with a field that cannot be sent is a reply of `actor`, to a message of type `asked`, that cannot.
         """
         try:
-            return self._encode_error(error)
+            return self.encode_own_error(error)
         except BadMessage as bad:
-            return self._encode_error(BadReply(actor, asked, f"{type_name(type(error))}: {bad.problem}"))
+            return self.encode_own_error(BadReply(actor, asked, f"{type_name(type(error))}: {bad.problem}"))
 
-    def _encode_error(self, error: BaseException) -> tuple[str, str, bytes]:
+    def encode_own_error(self, error: BaseException) -> tuple[str, str, bytes]:
+        """As `encode_error`, of one that is no answer to anybody. Raises BadMessage if it has such a field."""
         if isinstance(error, Refusal):
             schema = type(error).schema()
             fields = schema(*(getattr(error, name) for name in schema.__struct_fields__))

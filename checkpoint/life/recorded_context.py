@@ -555,7 +555,7 @@ class RecordedContext(ActorContext):
         text = error_text(error)
         try:
             if isinstance(error, HoldfastError):
-                return self.recorded.answer_error(error)
+                return Answer(*self._cell.node.codec.encode_own_error(error))
         except Exception as problem:  # It has fields of the user's own, of whatever types.
             text = f"what it has raised cannot be kept: {error_text(problem)}"
         return self.recorded.answer_error(EffectFailed(effect.key, 1, type_name(type(error)), text))

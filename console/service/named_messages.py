@@ -83,7 +83,7 @@ def _class_named(ref: ActorRef[Any], name: str) -> type[Message[Any]]:
     kind = cell_kind(ref._cell)
     if kind is None or kind is Actor:
         raise SpecError(ref.path, "its class is not known in this process, so no message for it can be made here")
-    handled = [one for one in kind._table if issubclass(one, Message)]
+    handled = [one for one in kind._declared if issubclass(one, Message)]
     known = {message_name(one): one for one in descended(*handled)}
     meant = [full for full in known if name in (full, full.partition(":")[2])]
     if len(meant) == 1:

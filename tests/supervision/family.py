@@ -12,7 +12,7 @@ class Boom(hf.Message): ...
 
 
 class Leave(hf.Message):
-    reason: hf.ExitReason = hf.NORMAL
+    reason: hf.ExitReason | None = None  # NORMAL, if it is left out
 
 
 class Life(hf.Message[int]): ...
@@ -73,7 +73,7 @@ class Kid(hf.Actor):
 
     @hf.on(Leave)
     def leave(self, message: Leave) -> None:
-        self.ctx.stop(message.reason)
+        self.ctx.stop(message.reason or hf.NORMAL)
 
     @hf.on(Life)
     def life(self, message: Life) -> int:

@@ -39,7 +39,7 @@ async def end(family: Family, name: str, how: str) -> None:
     elif how == "crash":
         family.ref(name).tell(Boom())
     else:
-        reasons = {"NORMAL": hf.NORMAL, "SHUTDOWN": hf.SHUTDOWN, 'Shutdown("x")': hf.Shutdown("x")}
+        reasons = {"NORMAL": None, "SHUTDOWN": hf.SHUTDOWN, 'Shutdown("x")': hf.Shutdown("x")}
         family.ref(name).tell(Leave(reasons[how]))
     await family.rest()
 

@@ -118,8 +118,8 @@ CHECKS = {
     ),
     "a refusal that cannot be sent is a reply that cannot": Check(
         "actors/kernel/codec.py",
-        '            return self._encode_error(BadReply(actor, asked, f"{type_name(type(error))}: {bad.problem}"))\n',
-        "            raise bad\n",
+        '            return self.encode_own_error(BadReply(actor, asked, f"{type_name(type(error))}: {bad.problem}"))',
+        "            raise bad",
         DECLARED,
         "a_reply_is_refused and refusal and recorded",
     ),
