@@ -185,7 +185,7 @@ class Actor:
         for name in sorted(members):
             handler = members[name]
             marks, subscribed = handled_by(handler), _topics_of(handler)
-            if not marks and name in marked and handler is not None:
+            if not marks and name in marked and members[name] is not None:
                 lost = " and ".join(f"@on({handles.kind.__name__})" for handles in marked[name])
                 raise TypeError(
                     f"{type_name(cls)}.{name} stands in the place of a handler and is none: write {lost} above it, "

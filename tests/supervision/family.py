@@ -12,7 +12,12 @@ class Boom(hf.Message): ...
 
 
 class Leave(hf.Message):
-    reason: hf.ExitReason | None = None  # NORMAL, if it is left out
+    reason: hf.ExitReason | None = None
+
+    @property
+    def why(self) -> hf.ExitReason:
+        """NORMAL, if nothing is said."""
+        return self.reason or hf.NORMAL
 
 
 class Life(hf.Message[int]): ...
@@ -73,7 +78,7 @@ class Kid(hf.Actor):
 
     @hf.on(Leave)
     def leave(self, message: Leave) -> None:
-        self.ctx.stop(message.reason or hf.NORMAL)
+        self.ctx.stop(message.why)
 
     @hf.on(Life)
     def life(self, message: Life) -> int:

@@ -185,7 +185,7 @@ class Ends(hf.Actor):
 
     @hf.on(Leave)
     def leave(self, message: Leave) -> None:
-        self.ctx.stop(message.reason)
+        self.ctx.stop(message.why)
 
     @hf.on(Life)
     def life(self, message: Life) -> int:

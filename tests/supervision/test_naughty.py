@@ -187,7 +187,7 @@ class Stranger(hf.Actor):
     @hf.on(Leave)
     def leave(self, message: Leave) -> None:
         self.ctx.link(self.ctx.find("/app/top", hf.Supervisor))
-        self.ctx.stop(message.reason)
+        self.ctx.stop(message.why)
 
 
 @pytest.mark.parametrize("reason", [hf.SHUTDOWN, hf.NORMAL, hf.Signal(9), hf.KILLED])

@@ -56,7 +56,7 @@ class Holder(hf.Actor):
 
     @hf.on(Leave)
     def leave(self, message: Leave) -> None:
-        self.ctx.stop(message.reason)
+        self.ctx.stop(message.why)
 
 
 async def open_names(system: hf.ActorSystem, **options: Any) -> Names:

@@ -62,7 +62,7 @@ DECLARED = "tests/supervision/test_declared_classes.py"
 CHECKS = {
     "what stands in the place of a handler is one": Check(
         "actors/kernel/actor.py",
-        "            if not marks and name in marked and handler is not None:\n",
+        "            if not marks and name in marked and members[name] is not None:\n",
         "            if False:\n",
         "tests/actors/test_actor.py",
         "stands_in_the_place",
