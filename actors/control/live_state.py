@@ -39,7 +39,12 @@ def live_state(actor: Actor) -> Any:
 def attributes(root: object) -> list[tuple[str, Any]]:
     """Names and values of the attributes of an object, also of one with slots."""
     slots = [(name, getattr(root, name)) for name in slots_of(type(root)) if hasattr(root, name)]
-    return [*getattr(root, "__dict__", {}).items(), *slots]
+    return [*_own(root).items(), *slots]
+
+
+def _own(root: object) -> dict[str, Any]:
+    """What stands in the object itself; nothing in one that has slots alone."""
+    return getattr(root, "__dict__", {})
 
 
 def set_attribute(holder: object, name: str, value: object, *, is_own: bool) -> None:
@@ -47,7 +52,7 @@ def set_attribute(holder: object, name: str, value: object, *, is_own: bool) -> 
 
     Such a one is set as it is. What a `__setattr__` of the class does beside that, it has done when it was set first.
     """
-    own = is_own or name in getattr(holder, "__dict__", ())
+    own = is_own or name in _own(holder)
     (object.__setattr__ if own else setattr)(holder, name, value)
 
 

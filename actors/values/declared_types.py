@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 import itertools
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, get_origin
 
 import msgspec
 from msgspec import inspect
@@ -88,7 +88,8 @@ class Declared(NamedTuple):
 
 def origin_of(cls: Any) -> type:
     """The class itself of a generic one with its parameters."""
-    return getattr(cls, "__origin__", cls)  # type: ignore[no-any-return]
+    found: type = get_origin(cls) or cls
+    return found
 
 
 def _find_class_fields(kind: Any) -> tuple[Declared, ...]:

@@ -511,7 +511,7 @@ class Life:
     def answer_value(self, value: object, declared: Any, asked: str) -> Answer:
         """A reply to a message of type `asked` as the asker will get it; one that cannot be coded becomes an error."""
         try:
-            return Answer(REPLY, "", self.cell.node.codec.encode_alike(value, known_at(self.cell), declared))
+            return Answer(REPLY, "", self.cell.node.codec.encode_alike(value, self.cell.path, declared))
         except BadMessage as error:
             return self.answer_error(BadReply(known_at(self.cell), asked, error.problem))
 

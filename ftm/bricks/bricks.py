@@ -166,12 +166,12 @@ class Before(Brick):
         """
         codec, message = self._standing.node.codec, self.message_of(request)
         kind: type[Message[Any]] = type(message)
-        declared = None if message is None else reply_type(kind)
         try:
+            declared = None if message is None else reply_type(kind)
             body = codec.encode(reply, self._standing.address, declared)
             if message is not None:
                 codec.decode(declared, body)
-        except (BadMessage, msgspec.MsgspecError) as error:
+        except (BadMessage, msgspec.MsgspecError, TypeError) as error:  # Its type may not be known in its module.
             problem = error.problem if isinstance(error, BadMessage) else str(error)
             return self.refuse(
                 work,

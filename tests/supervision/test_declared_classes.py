@@ -50,6 +50,10 @@ class Options(TypedDict, total=False):
     corner: Point
 
 
+class Size(TypedDict, total=False):
+    width: int
+
+
 class Mixed(enum.Enum):
     NUMBER = 1
     TEXT = "one"
@@ -77,6 +81,7 @@ class Draw(hf.Message[str]):
     union: Square | Dot | None = None
     point: Point | None = None
     options: Options | None = None
+    size: Size | None = None
     pixels: np.ndarray[Any, Any] | None = None
 
 
@@ -154,7 +159,7 @@ LOST = {
     "another message": (Draw(message=Ping()), "field 'message': a "),
     "an exit reason": (Draw(reason=hf.Shutdown("late")), "str(reason)"),
     "a named tuple": (Draw(point=Named(1, 2)), "field 'point': a "),
-    "a key": (Draw(options=MORE), "field 'options': the key 'height' is none of"),
+    "a key": (Draw(size=MORE), "field 'size': the key 'height' is none of"),
     "a value of a key": (Draw(options={"corner": Named(1, 2)}), "field \"options['corner']\": a "),
     "a mask": (Draw(pixels=np.ma.masked_array([1, 2], [True, False])), "send its data and its mask"),
     "a class of arrays": (Draw(pixels=np.zeros(2).view(np.recarray)), "send numpy.asarray(...) of it"),

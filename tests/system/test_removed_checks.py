@@ -60,6 +60,27 @@ SETTERS = "tests/checkpoint/test_own_setters.py"
 DECLARED = "tests/supervision/test_declared_classes.py"
 
 CHECKS = {
+    "a class of arrays does not get lost": Check(
+        "actors/kernel/codec.py",
+        '    raise TypeError(f"a {type_name(kind)} would arrive as a plain array; send numpy.asarray(...) of it")\n',
+        "",
+        DECLARED,
+        "a_message_is_refused and class and arrays and process",
+    ),
+    "a key of a typed dict does not get lost": Check(
+        "actors/values/declared_types.py",
+        "any(issubclass(kind, dict) or kind.__subclasses__() for kind in self.classes)",
+        "any(kind.__subclasses__() for kind in self.classes)",
+        DECLARED,
+        "a_message_is_refused and key and process",
+    ),
+    "an error names the address that others know": Check(
+        "actors/kernel/codec.py",
+        "    return cell.path if cell.actor is None else cell.actor.ctx.path\n",
+        "    return cell.path\n",
+        "tests/checkpoint/test_derived_messages.py",
+        "is_handled_is_refused and protected",
+    ),
     "what stands in the place of a handler is one": Check(
         "actors/kernel/actor.py",
         "            if not marks and name in marked and members[name] is not None:\n",
