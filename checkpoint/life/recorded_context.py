@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import dataclasses
 import functools
 import hashlib
 import types
@@ -73,17 +74,16 @@ class KeptHandle(SavedHandle):
         return f"{type(self).__name__}(id={self.id!r})"
 
 
+@dataclasses.dataclass(slots=True, eq=False, repr=False)
 class RecordedReplyHandle(KeptHandle, ReplyHandle[R]):
     """The right to answer one ask of a recorded actor later."""
 
-    __slots__ = ()
-
     id: int
+    asked: str = ""  # the name of the message; one that was saved by an earlier version has none
 
     def reply(self, value: R) -> None:
         life = _own_life("answers later")
-        # What was declared is not known here: sets are looked for.
-        self._answer(life, life.answer_value(value, set, "what it has answered later"))
+        self._answer(life, life.answer_later(value, self.asked))
 
     def fail(self, error: HoldfastError) -> None:
         require_error(error)
@@ -364,7 +364,7 @@ class RecordedContext(ActorContext):
             return RecordedReplyHandle(-1)
         if not self.recorded.is_live:
             self.recorded.restored.promises.add(feed.id)
-        return RecordedReplyHandle(feed.id)
+        return RecordedReplyHandle(feed.id, feed.name)
 
     async def publish(self, topic: str, message: Message[Any]) -> None:
         if not self._in_turn():

@@ -22,6 +22,7 @@ from ...actors.errors import (
     ControlFailed,
     HoldfastError,
     StartFailed,
+    UnknownMessage,
     remote_crash,
     type_name,
 )
@@ -507,6 +508,14 @@ class Life:
             return self.answer_value(value, reply_type(kind), asked)
         except TypeError as error:  # A name in the type of the reply is not known in the module of the message.
             return self.answer_error(BadReply(known_at(self.cell), asked, str(error)))
+
+    def answer_later(self, value: object, asked: str) -> Answer:
+        """As `answer_reply`, to a message of this name; one that is not handled any more declares nothing."""
+        try:
+            kind = self.cell.table.kind_named(asked)
+        except UnknownMessage:
+            return self.answer_value(value, set, asked.replace(":", "."))  # As with Any, but sets are looked for.
+        return self.answer_reply(value, kind)
 
     def answer_value(self, value: object, declared: Any, asked: str) -> Answer:
         """A reply to a message of type `asked` as the asker will get it; one that cannot be coded becomes an error."""

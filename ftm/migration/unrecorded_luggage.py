@@ -43,7 +43,7 @@ def save_owing(actor: Actor) -> tuple[bytes, dict[int, Ask]]:
             return RecordedReplyHandle[Any](-1)
         number = next((number for number, one in owed.items() if one is ask), FIRST_OWED - len(owed))
         owed[number] = ask
-        return RecordedReplyHandle[Any](number)
+        return RecordedReplyHandle[Any](number, message_name(type(ask.message)))
 
     try:
         data = save_state(actor)

@@ -3,7 +3,9 @@
 It is, wherever a message, reply or refusal is coded: on its way to or from a process, and into a journal.
 """
 
+import asyncio
 import enum
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypedDict
 
@@ -12,7 +14,7 @@ import numpy as np
 import pytest
 
 import holdfast as hf
-from holdfast.errors import BadMessage, BadReply
+from holdfast.errors import BadMessage, BadReply, RemoteCrash
 
 
 class Shape(msgspec.Struct):
@@ -97,6 +99,17 @@ class Reply(hf.Message[Shape | list[Row] | None]):
     what: str
 
 
+class Later(hf.Message[Shape | list[Row] | None]):
+    """As Reply, answered by Give."""
+
+
+class Give(hf.Message[None]):
+    what: str
+
+
+class Crash(hf.Message[None]): ...
+
+
 class TooMany(hf.Refusal):
     shape: Shape
 
@@ -109,6 +122,9 @@ class Pass(hf.Message[str]):
 
 
 class Board(hf.Actor):
+    def __init__(self) -> None:
+        self.owed: hf.ReplyHandle[Any] | None = None
+
     @hf.on(Draw)
     async def draw(self, message: Draw) -> str:
         return repr(message)
@@ -122,15 +138,26 @@ class Board(hf.Actor):
 
     @hf.on(Reply)
     async def reply(self, message: Reply) -> Shape | list[Row] | None:
-        match message.what:
-            case "circle":
-                return Circle("a", 2.5)
-            case "rows":
-                return [Row("a", [Marked("b", [], 3)])]
-            case "refusal":
-                raise TooMany(Circle("a", 2.5))
-            case _:
-                return Shape("a")
+        if message.what == "refusal":
+            raise TooMany(Circle("a", 2.5))
+        return REPLIES[message.what]
+
+    @hf.on(Later)
+    async def later(self, message: Later) -> Any:
+        self.owed = self.ctx.reply_handle()
+        return self.owed
+
+    @hf.on(Give)
+    async def give(self, message: Give) -> None:
+        assert self.owed is not None
+        if message.what == "refusal":
+            self.owed.fail(TooMany(Circle("a", 2.5)))
+        else:
+            self.owed.reply(REPLIES[message.what])
+
+    @hf.on(Crash)
+    async def crash(self, message: Crash) -> None:
+        raise RuntimeError("on purpose")
 
     @hf.on(Pass)
     async def pass_on(self, message: Pass) -> str:
@@ -150,6 +177,11 @@ class Board(hf.Actor):
         return "handed on"
 
 
+REPLIES: dict[str, Any] = {
+    "circle": Circle("a", 2.5),
+    "rows": [Row("a", [Marked("b", [], 3)])],
+    "shape": Shape("a"),
+}
 MORE: Any = {"width": 1, "height": 2}
 LOST = {
     "a field": (Draw(shape=Circle("a", 2.5)), "field 'shape': a "),
@@ -185,7 +217,7 @@ async def started(system: hf.ActorSystem, isolation: Any, recovery: hf.Method | 
     """An actor whose messages are coded, and one beside it at /app/top/far."""
     far = hf.child("far", hf.start(Board), isolation="process")
     board = hf.child("board", hf.start(Board), isolation=isolation, recovery=recovery)
-    await system.start(hf.supervisor("top", children=[far, board]))
+    await system.start(hf.supervisor("top", children=[far, board], intensity=100))
     return system.ref("/app/top/board", Board)
 
 
@@ -232,6 +264,23 @@ async def test_a_reply_is_refused_that_would_lose_a_class(
     with pytest.raises(BadReply, match="would arrive as that"):
         await board.ask(Reply(what))
     assert await board.ask(Reply("shape")) == Shape("a")
+
+
+@CODED
+@pytest.mark.parametrize("what", ["circle", "rows", "refusal"])
+async def test_a_reply_by_a_handle_is_refused_that_would_lose_a_class(
+    system: hf.ActorSystem, isolation: str, recovery: hf.Method | None, what: str
+) -> None:
+    board = await started(system, isolation, recovery)
+    for asked, outcome in ((what, pytest.raises(BadReply, match="would arrive as that")), ("shape", nullcontext())):
+        owed = asyncio.ensure_future(board.ask(Later()))
+        await board.ask(KEPT[0])
+        if recovery is not None:  # The handle is one that a restart has brought back.
+            with pytest.raises(RemoteCrash):
+                await board.ask(Crash())
+        await board.ask(Give(asked))
+        with outcome:
+            assert await owed == Shape("a")
 
 
 @CODED

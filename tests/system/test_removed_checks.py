@@ -137,6 +137,13 @@ CHECKS = {
         DECLARED,
         "a_message_is_refused and recorded",
     ),
+    "nor in what a recorded actor answers later": Check(
+        "checkpoint/life/recorded_life.py",
+        "            kind = self.cell.table.kind_named(asked)\n",
+        '            kind = self.cell.table.kind_named("")\n',
+        DECLARED,
+        "test_a_reply_by_a_handle and circle and recorded",
+    ),
     "a refusal that cannot be sent is a reply that cannot": Check(
         "actors/kernel/codec.py",
         '            return self.encode_own_error(BadReply(actor, asked, f"{type_name(type(error))}: {bad.problem}"))',
