@@ -81,6 +81,24 @@ async def test_a_reply_leaves_only_when_the_follower_has_the_request(system: hf.
     assert await driver.reply(key) == 1
 
 
+class Slow(Total):
+    """Takes longer than whoever asks waits."""
+
+    @hf.on(Add)
+    async def add(self, message: Add) -> int:  # type: ignore[override]
+        await asyncio.sleep(1.0)
+        self.seen.append(message.n)
+        return sum(self.seen)
+
+
+async def test_what_waits_behind_a_turn_of_its_batch_is_handled_when_its_time_is_over(system: hf.ActorSystem) -> None:
+    """Whether the time is over is decided for both replicas, when the batch leaves for the follower."""
+    driver = await pair(system, Slow, LFR())
+    first, second = driver.send(Add(1), Add(2), deadline=system._node.loop.time() + 1.0)
+    assert [await driver.reply(first), await driver.reply(second)] == [1, 3]
+    assert await driver.ask(Read()) == [1, 2]
+
+
 async def test_hidden_nondeterminism_is_told_and_the_follower_takes_the_state(system: hf.ActorSystem) -> None:
     """T8: the first request that came out differently is named."""
     driver = await pair(system, Total, LFR())

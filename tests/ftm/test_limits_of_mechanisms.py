@@ -107,6 +107,59 @@ async def test_an_alternate_that_blocks_costs_the_life_and_its_message_is_put_as
     assert await ref.ask(Add(2), timeout=60) == 1, "without recovery the state went with the life"
 
 
+class Book(hf.Message[None]):
+    who: str
+
+
+class Open(hf.Message[None]): ...
+
+
+class Booked(hf.Message[list[str]]): ...
+
+
+class Hotel(hf.Actor):
+    """Puts aside what comes before it is open."""
+
+    def __init__(self) -> None:
+        self.is_open = False
+        self.booked: list[str] = []
+
+    @hf.on(Book)
+    def book(self, message: Book) -> None:
+        if self.is_open:
+            self.booked.append(message.who)
+        else:
+            self.ctx.stash()
+
+    @hf.on(Open)
+    def open(self, message: Open) -> None:
+        self.is_open = True
+        self.ctx.unstash()
+
+    @hf.on(Booked)
+    def all_booked(self, message: Booked) -> list[str]:
+        return self.booked
+
+
+@pytest.mark.parametrize(
+    ("mechanism", "served"),
+    [(hf.ftm.PBR(), []), (hf.ftm.TMR(), []), (hf.ftm.LFR(), ["late"]), (hf.ftm.TR(), ["late"])],
+    ids=["pbr", "tmr", "lfr", "tr"],
+)
+async def test_behind_lfr_and_tr_an_ask_that_was_put_aside_is_handled_when_its_time_is_over(
+    system: hf.ActorSystem, mechanism: Any, served: list[str]
+) -> None:
+    """The replicas, or the runs, have decided together that it was begun in time."""
+    hotel = await system.start(hf.child("hotel", hf.start(Hotel), mechanism=mechanism))
+    assert await hotel.ask(Booked(), timeout=60) == []
+    late = hotel.ask(Book("late"), timeout=3.0)
+    assert await hotel.ask(Booked(), timeout=60) == []
+    with pytest.raises(hf.AskTimeout):
+        await late
+    await hotel.ask(Open(), timeout=60)
+    assert await hotel.ask(Booked(), timeout=60) == served
+
+
 class Promise(hf.Message[str]): ...
 
 
