@@ -80,6 +80,7 @@ if TYPE_CHECKING:
     from opentelemetry.trace import Tracer
 
 A = TypeVar("A", bound=Actor)
+P = TypeVar("P")
 
 ENTRY = f"{__package__}.worker_main:main"
 BASE = (f"{__package__}.worker_main",)
@@ -188,6 +189,8 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
         self._sink: LogSink | None = None
         self._history: HistoryRecorder | None = None
         self._running: Node | None = None
+        self._open_homes: Homes | None = None
+        self._open_lines: Lines | None = None
         self._root: Cell | None = None
         self._body: asyncio.Task[Any] | None = None
         self._closing: asyncio.Task[None] | None = None
@@ -573,9 +576,30 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
     @property
     def _node(self) -> Node:
         """The node that hosts this process's actors."""
-        if self._running is None:
+        return self._part_of_run(self._running)
+
+    @property
+    def _homes(self) -> Homes:
+        """All recorded addresses, for those who change the tree."""
+        return self._part_of_run(self._open_homes)
+
+    @_homes.setter
+    def _homes(self, homes: Homes) -> None:
+        self._open_homes = homes
+
+    @property
+    def _lines(self) -> Lines:
+        """The lines to other systems."""
+        return self._part_of_run(self._open_lines)
+
+    @_lines.setter
+    def _lines(self, lines: Lines) -> None:
+        self._open_lines = lines
+
+    def _part_of_run(self, part: P | None) -> P:
+        if part is None:
             raise HoldfastError(f"system {self.name!r} is not running: use it in `async with`")
-        return self._running
+        return part
 
     def from_thread(self) -> ThreadPortal:
         """Return a handle for other threads, such as those in which a web framework runs its plain `def` endpoints."""

@@ -121,11 +121,18 @@ async def test_a_system_is_entered_once() -> None:
 
 async def test_a_system_that_was_not_entered_says_so() -> None:
     system = hf.ActorSystem("app", log=False)
-    for call in (lambda: system.spawn(hf.start(Kid)), lambda: system.ref("/app/x", Kid), system.events):
+    for call in (
+        lambda: system.spawn(hf.start(Kid)),
+        lambda: system.ref("/app/x", Kid),
+        system.events,
+        system.connected,
+    ):
         with pytest.raises(hf.HoldfastError, match="system 'app' is not running: use it in `async with`"):
             call()
     with pytest.raises(hf.HoldfastError, match="is not running"):
         await system.start(hf.child("x", hf.start(Kid)))
+    with pytest.raises(hf.HoldfastError, match="is not running"):
+        await system.backup("copy.db")
     assert system.tree() == []
     await system.shutdown()  # Nothing to stop is no error.
 
