@@ -220,7 +220,6 @@ class DynamicSupervisor(Supervisor):
         if start.kind is one.spec.start.kind:
             return
         if one.cell is not None and one.cell.state is not GONE:
-            one.cell.table = start.kind._table
             respec(one.cell, start)
         else:
             before, one.spec = one.spec, dataclasses.replace(one.spec, start=start)

@@ -31,6 +31,10 @@ def respec(cell: Cell, start: Start[Any], *, is_lent: bool = False) -> None:
     """
     spec = dataclasses.replace(cell.spec, start=start) if isinstance(cell.spec, ChildSpec) else cell.spec
     cell.extra().start = start
+    if not is_lent:
+        cell.table = start.kind._table  # Who sends before the next life begins sends what that handles.
+        if (tap := cell.extra().tap) is not None:
+            tap.attach()
     _change(cell, spec, lambda known: dataclasses.replace(known, start=start), is_noted=not is_lent)
 
 

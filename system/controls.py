@@ -180,9 +180,6 @@ class Controls:
                 switch.arrival.becomes = None
         if recipe is not None:
             start = unpack_recipe(recipe, imports=False)
-            cell.table = start.kind._table
-            if cell.more is not None and cell.more.tap is not None:
-                cell.more.tap.attach()
             respec(cell, start)
 
     async def _turn_in_hand(self, target: Target, *, is_left: bool = False) -> str:

@@ -219,14 +219,7 @@ class Rework(StagedWork):
             switch.arrival.take_ahead([SNAPSHOT.decode(piece) for piece in self._saved])
             refuse_unsaved(cell, switch, before)
         if start is not None:
-            self._known_as(cell, start)
-
-    @staticmethod
-    def _known_as(cell: Cell, start: Start[Any]) -> None:
-        cell.table = start.kind._table
-        if cell.more is not None and cell.more.tap is not None:
-            cell.more.tap.attach()
-        respec(cell, start)
+            respec(cell, start)
 
     def _tell(self, cell: Cell, wanted: Order) -> None:
         if not lives_here(cell):
