@@ -256,6 +256,9 @@ def _check_codable(cell: Cell, item: Any) -> None:
 class WorkerHome(Home):
     """A home whose lives can be lived in a process of their own."""
 
+    keeps_links = True
+    """Whether a life's links outlive it, so that its end is told here, and its process knows of none of them."""
+
     def enter(self, cell: Cell) -> Any:
         """A life is to begin: from here on what is sent is admitted by the home. Returns what `goes_on` needs.
 
@@ -310,6 +313,7 @@ class FlightHome(WorkerHome):
     """A queue here, and what is on its way to the process: sent again to the next life unless it was begun."""
 
     takes_parcels = True
+    keeps_links = False
 
     def enter(self, cell: Cell) -> None:
         more = cell.extra()
@@ -587,7 +591,8 @@ class WorkerPlace(Place):
 
     def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
         worker = self.workers.of(cell)
-        if worker is not None and verb in ("bind", "link", "unlink"):  # What its process has to know of itself.
+        its_own = ("bind",) if self.home.keeps_links else ("bind", "link", "unlink")
+        if worker is not None and verb in its_own:  # What its process has to know of itself.
             worker.connection.send(frames.Command(worker.connection.names.to_wire(cell.path), verb, data))
 
 

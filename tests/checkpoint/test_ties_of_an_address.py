@@ -58,6 +58,41 @@ class Watcher(hf.Actor):
         self.told.append(f"EXIT {source.path}")
 
 
+class Crash(hf.Message): ...
+
+
+class Life(hf.Message[int]): ...
+
+
+class Fragile(hf.Actor):
+    @hf.on(Crash)
+    def crash(self, message: Crash) -> None:
+        raise RuntimeError("too hot in here")
+
+    @hf.on(Life, readonly=True)
+    def life(self, message: Life) -> int:
+        return self.ctx.life
+
+
+class LinkedWith(hf.Actor):
+    """A plain actor that is linked with another one."""
+
+    def __init__(self, path: str) -> None:
+        self.path = path
+        self.told: list[str] = []
+
+    def on_start(self, restored: bool) -> None:
+        self.ctx.trap_exits = True
+        self.ctx.link(self.ctx.find(self.path, Fragile))
+
+    @hf.on(Told)
+    def read(self, message: Told) -> list[str]:
+        return self.told
+
+    def on_exit(self, source: hf.ActorRef[Any], reason: hf.ExitReason) -> None:
+        self.told.append(f"EXIT {source.path}")
+
+
 @pytest.mark.pairs
 @pytest.mark.parametrize("hook", ["none", "on_start", "on_recovered"])
 @pytest.mark.parametrize("end", ["crash", "terminated and restarted", "its supervisor is restarted"])
@@ -89,3 +124,24 @@ async def test_they_are_there_once_in_the_next_life(
         while len(await watcher.ask(Told())) < 3:
             pass
     assert sorted(await watcher.ask(Told())) == ["DOWN /app/monitored", "DOWN /app/watched", "EXIT /app/linked"]
+
+
+@pytest.mark.pairs
+@pytest.mark.parametrize("above", ["task", "process"])
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_who_is_linked_with_one_that_recovers_hears_of_no_crash(
+    system: hf.ActorSystem, isolation: Any, above: Any
+) -> None:
+    """Wherever the recovered one lives: its process knows of none of its links, and tells nobody of its end."""
+    spec = hf.child("linked", hf.start(Fragile), recovery=hf.hybrid(), isolation=isolation)
+    await system.start(hf.supervisor("above", children=[spec], intensity=10, isolation=above))
+    fragile = system.ref("/app/above/linked", Fragile)
+    ones = []
+    for n in range(5):  # Whether a process tells of a link is a race between that and its own end.
+        ones.append(await system.start(hf.child(f"one{n}", hf.start(LinkedWith, fragile.path))))
+        with pytest.raises(hf.RemoteCrash):
+            await fragile.ask(Crash(), timeout=20.0)
+        assert await fragile.ask(Life(), timeout=20.0) == n + 2
+    assert [await one.ask(Told()) for one in ones] == [[]] * 5
+    await system.stop(fragile)
+    assert [await one.ask(Told()) for one in ones] == [["EXIT /app/above/linked"]] * 5
