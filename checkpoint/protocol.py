@@ -513,6 +513,12 @@ class Wanted(msgspec.Struct, array_like=True, tag=17):
     bindings: dict[str, str] = {}
     register: GivenName | None = None
     made_up: bool = False
+    goes_on: bool = True
+    """Whether the end of its last life is followed by one that goes on where it was; the root takes it down."""
+
+    def restarts(self, reason: ExitReason) -> bool:
+        """Whether another life follows, as its supervisor has said."""
+        return self.goes_on
 
 
 class Closed(msgspec.Struct, array_like=True, tag=18):

@@ -499,6 +499,8 @@ def _tell_end(cell: Cell, reason: ExitReason, *, recovers: bool) -> None:
     """Tell of the end of a life whose supervisor is in another process: that one decides what follows."""
     more = cell.extra()
     cell.state, more.reason = DOWN, reason
+    if isinstance(cell.spec, Wanted):  # Whoever links with it now is linked with the next life, if there is one.
+        cell.spec = msgspec.structs.replace(cell.spec, goes_on=recovers)
     lifecycle.free_names(cell)
     links.announce(cell, reason, recovering=recovers)
     lifecycle.tell_enders(more, reason)

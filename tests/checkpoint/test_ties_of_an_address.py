@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
+from holdfast.actors.kernel.cell import DOWN, GONE
 
 
 class Tie(hf.Message):
@@ -74,16 +75,25 @@ class Fragile(hf.Actor):
         return self.ctx.life
 
 
+class Link(hf.Message[None]): ...
+
+
 class LinkedWith(hf.Actor):
     """A plain actor that is linked with another one."""
 
-    def __init__(self, path: str) -> None:
-        self.path = path
+    def __init__(self, path: str, *, at_once: bool = True) -> None:
+        self.path, self.at_once = path, at_once
         self.told: list[str] = []
 
     def on_start(self, restored: bool) -> None:
         self.ctx.trap_exits = True
-        self.ctx.link(self.ctx.find(self.path, Fragile))
+        self.other = self.ctx.find(self.path, Fragile)
+        if self.at_once:
+            self.link(Link())
+
+    @hf.on(Link)
+    def link(self, message: Link) -> None:
+        self.ctx.link(self.other)
 
     @hf.on(Told)
     def read(self, message: Told) -> list[str]:
@@ -145,3 +155,32 @@ async def test_who_is_linked_with_one_that_recovers_hears_of_no_crash(
     assert [await one.ask(Told()) for one in ones] == [[]] * 5
     await system.stop(fragile)
     assert [await one.ask(Told()) for one in ones] == [["EXIT /app/above/linked"]] * 5
+
+
+@pytest.mark.parametrize("above", ["task", "process"])
+@pytest.mark.parametrize("isolation", ["task", "process"])
+@pytest.mark.parametrize("restart", ["permanent", "temporary"])
+async def test_who_links_with_one_between_two_lives_is_linked_with_the_next(
+    system: hf.ActorSystem, isolation: Any, above: Any, restart: Any
+) -> None:
+    """And hears at once that there is nobody if none comes."""
+    nothing = hf.child("nothing", hf.start(Fragile))  # It stays, so that the other one's end is not the supervisor's.
+    slowly = hf.Backoff(0.3)  # So that there is a time between two lives.
+    spec = hf.child(
+        "linked", hf.start(Fragile), recovery=hf.hybrid(), isolation=isolation, restart=restart, backoff=slowly
+    )
+    await system.start(hf.supervisor("above", children=[nothing, spec], intensity=10, isolation=above))
+    fragile = system.ref("/app/above/linked", Fragile)
+    other = await system.start(hf.child("other", hf.start(LinkedWith, fragile.path, at_once=False)))
+    with pytest.raises(hf.RemoteCrash):
+        await fragile.ask(Crash(), timeout=20.0)
+    while fragile._cell.state not in (DOWN, GONE):
+        await asyncio.sleep(0)
+    await other.ask(Link())
+    if restart == "permanent":
+        assert await fragile.ask(Life(), timeout=20.0) == 2
+        assert await other.ask(Told()) == []
+        await system.stop(fragile)
+    async with asyncio.timeout(20.0):
+        while await other.ask(Told()) != ["EXIT /app/above/linked"]:
+            pass
