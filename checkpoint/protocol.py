@@ -313,12 +313,14 @@ class Over(msgspec.Struct, array_like=True, tag=9):
 class Respec(msgspec.Struct, array_like=True, tag=10):
     """The child has other mechanisms from now on, also in its next lives: layers as data, none if there are none.
 
-    `isolation` and `limits`: where it lives without a mechanism.
+    `isolation` and `limits`: where it lives without a mechanism. `start`: the recipe of its next lives, if it is another
+    one than before.
     """
 
     layers: list[Any]
     isolation: str = "task"
     limits: dict[str, Any] = {}
+    start: bytes = b""
 
 
 class Glance(msgspec.Struct, array_like=True, tag=24):
