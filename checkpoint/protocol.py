@@ -313,12 +313,14 @@ class Over(msgspec.Struct, array_like=True, tag=9):
 class Respec(msgspec.Struct, array_like=True, tag=10):
     """The child has other mechanisms from now on, also in its next lives: layers as data, none if there are none.
 
-    `isolation` and `limits`: where it lives without a mechanism.
+    `isolation` and `limits`: where it lives without a mechanism. `start`: the recipe of its next lives, if that is not
+    as before.
     """
 
     layers: list[Any]
     isolation: str = "task"
     limits: dict[str, Any] = {}
+    start: bytes = b""
 
 
 class Glance(msgspec.Struct, array_like=True, tag=24):
@@ -463,6 +465,18 @@ class GivenUp(msgspec.Struct, array_like=True, tag=27):
     k: int
 
 
+class Unreadable(msgspec.Struct, array_like=True, tag=31):
+    """The life cannot read what has come of its output (turn, k), and an earlier one could: its code is another."""
+
+    turn: int
+    k: int
+    problem: str
+
+
+MidTurn = Released | Performed | Retried | GivenUp | Unreadable
+"""What a life says in the middle of a turn."""
+
+
 class Glanced(msgspec.Struct, array_like=True, tag=25):
     """The input `id`, an ask that changes nothing, has this answer, and is not handled in a turn."""
 
@@ -546,6 +560,7 @@ ToHome = (
     | Performed
     | Retried
     | GivenUp
+    | Unreadable
     | Glanced
     | Unsaved
     | Wanted

@@ -24,6 +24,8 @@ NO_RECIPE = (
 def respec(cell: Cell, start: Start[Any], *, is_lent: bool = False) -> None:
     """The next lives at `cell` begin with `start`: its own recipe, its supervisor's spec, and the recipes above.
 
+    Its supervisor is told, if that is in another process.
+
     `is_lent`: to try it only, so that no journal notes it.
 
     Raises:
@@ -36,6 +38,7 @@ def respec(cell: Cell, start: Start[Any], *, is_lent: bool = False) -> None:
         if (tap := cell.extra().tap) is not None:
             tap.attach()
     _change(cell, spec, lambda known: dataclasses.replace(known, start=start), is_noted=not is_lent)
+    cell.host.parent.begins_with(cell, start)
 
 
 def replace_place(cell: Cell, spec: ChildSpec, *, is_lent: bool = False) -> None:

@@ -311,6 +311,9 @@ class Parent:
     def respecified(self, cell: Cell, spec: dict[str, Any]) -> None:
         """The next lives there are lived otherwise than the last: what of the spec says so, as data."""
 
+    def begins_with(self, cell: Cell, start: Start[Any]) -> None:
+        """The next lives there begin with this, and not as the last."""
+
 
 class AddressHost:
     """The host of an address: a home, a place, and a parent."""

@@ -59,6 +59,7 @@ from ..protocol import (
     Snapshot,
     ToHome,
     TurnEnd,
+    Unreadable,
     Unsaved,
     Waits,
     Wanted,
@@ -480,6 +481,8 @@ class Switch:
                     self.calls.retried(record)
                 case GivenUp():
                     self.calls.give_up(record)
+                case Unreadable():
+                    raise ReplayDiverged(self.path, record.turn, record.k, record.problem)
                 case Glanced():
                     self.calls.rests.glanced(record)
                 case Hooked():

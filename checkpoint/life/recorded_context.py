@@ -21,8 +21,10 @@ from ...actors.errors import (
     BadMessage,
     BadReply,
     ControlFailed,
+    DamagedValue,
     EffectFailed,
     HoldfastError,
+    UnsavableValue,
     error_text,
     remote_crash,
     type_name,
@@ -39,7 +41,7 @@ from ...actors.kernel.node import check_sought, written
 from ...actors.kernel.ref import ActorRef, cell_of, current
 from ...actors.kernel.timers import Timer
 from ...actors.seconds import check_seconds
-from ...actors.values import encode_value
+from ...actors.values import decode_value, encode_value
 from ...actors.values.path_parts import check_topic
 from ...actors.values.saved_refs import SavedHandle
 from ..protocol import REPLY, SINCE_THEN, Answer, EndWanted, Feed, Perform, Performed, PipeDone, Retried
@@ -539,7 +541,7 @@ class RecordedContext(ActorContext):
 
         try:
             value = await self._perform(effect, failed, attempt)
-            answer = Answer(REPLY, "", encode_value(value, where=f"the result of {effect.key}"))
+            answer = Answer(REPLY, "", self._as_kept(effect, value))
         except Exception as error:
             answer = self._kept(effect, error)
         if self._closed or (turn, k) not in life.waits.outcomes:
@@ -549,6 +551,17 @@ class RecordedContext(ActorContext):
         except BadMessage as error:
             why = f"what it has returned is too large to leave its process: {error.problem}; return where it is instead"
             life.port.to_home(Performed(turn, k, self._kept(effect, BadReply(self.path, effect.key, why))))
+
+    def _as_kept(self, effect: EffectCall, value: object) -> bytes:
+        """What an effect has returned, as it is kept. Raises UnsavableValue: no later life could read it."""
+        where = f"the result of {effect.key}"
+        body = encode_value(value, where=where)
+        try:
+            decode_value(body, refs=self._cell.node.ref_at)
+        except DamagedValue as error:
+            problem = f"{type_name(type(value))}, which could not be read again ({error.problem}),"
+            raise UnsavableValue(where, problem) from error
+        return body
 
     def _kept(self, effect: EffectCall, error: Exception) -> Answer:
         """An error as the outcome of an effect, or why it cannot be one."""

@@ -69,6 +69,7 @@ from ..protocol import (
     ToHome,
     ToLife,
     TurnEnd,
+    Unreadable,
     Unsaved,
     Waits,
     pieces,
@@ -297,7 +298,11 @@ class Life:
                 error = self.cell.node.codec.decode_error(answer.kind, answer.name, answer.body, *self._asked(awaited))
                 future.set_exception(error)
         except Exception as error:
-            future.set_exception(BadReply(*self._asked(awaited), str(error)))
+            if isinstance(awaited, EffectCall):  # It was read before it counted, so its class has changed since.
+                why = f"what {awaited.key} has returned: {error}"
+                self.port.to_home(Unreadable(record.turn, record.k, why))
+            else:
+                future.set_exception(BadReply(*self._asked(awaited), str(error)))
         return True
 
     def _asked(self, awaited: Awaited) -> tuple[str, str]:

@@ -25,6 +25,7 @@ from ...actors.kernel.mailbox import Bound
 from ...actors.process.process_host import RemoteBound
 from ...actors.process.stand_ins import know
 from ...actors.process.wire import frames
+from ...actors.process.wire.start_codec import pack_recipe
 from ...actors.process.worker_pool import Worker, Workers
 from ..home.homes import Homes
 from ..home.journal_home import Entered, JournalHome
@@ -282,6 +283,10 @@ class FarParent(Parent):
     def respecified(self, cell: Cell, spec: dict[str, Any]) -> None:
         if self.worker is not None:
             self.port().to_life(Respec(**spec))
+
+    def begins_with(self, cell: Cell, start: Start[Any]) -> None:
+        if self.is_at_root:  # Else the process in which it lives has heard of it first.
+            self.respecified(cell, {**cell.host.place.spec_data(cell), "start": pack_recipe(start, self.path)})
 
     def retired(self, cell: Cell) -> None:
         left = cell.host.place.left(cell) if self.is_at_root else []

@@ -29,7 +29,7 @@ from ..journal import Saved
 from ..life.recorded_context import RecordedContext
 from ..life.recorded_life import FED, Life, LifePlace
 from ..method import Method
-from ..protocol import AWAITED, FAILED, Answer, Feed, Out, Outcome, Released, ToHome, TurnEnd
+from ..protocol import AWAITED, FAILED, Answer, Feed, Out, Outcome, Released, ToHome, TurnEnd, Unreadable
 from ..snapshot.snapshot_record import take_over
 
 if TYPE_CHECKING:
@@ -288,6 +288,8 @@ class Rerun:
                     self._ended(record)
                 case Released():
                     self._sent(record.turn, record.id, record.outs)
+                case Unreadable():
+                    raise ReplayDiverged(self._cell.path, record.turn, record.k, record.problem)
                 case _:
                     pass
         except ReplayDiverged as error:

@@ -145,7 +145,7 @@ class BodyMapper(_Walk):
                     f"{field.name} is new and has no default; give it one, or say what it was: "
                     f"@hf.renamed({field.name}='...')"
                 )
-            else:
+            elif not may_be_missing(field):
                 made[field.encode_name] = self._default(field)
         return coded(made, info)
 
@@ -179,8 +179,11 @@ class BodyUnmapper(_Walk):
         for index, old in enumerate(row.fields):
             field = found.get(old)
             is_other = field is None or (row.types and in_words(field.type) != row.types[index])
-            if field is None or is_other or field.encode_name not in named:
+            is_missing = field is not None and field.encode_name not in named
+            if field is None or is_other or (is_missing and not may_be_missing(field)):
                 raise NotMapped(f"{old} is not what it was")
+            if is_missing:
+                continue
             made[old] = self.of(named[field.encode_name], field.type, inner(row.place, old), above)
         tag = row.tag if row.tag is not None else tag_of(info)
         return _coded(made, tag, in_order=row.by_position)
@@ -188,6 +191,11 @@ class BodyUnmapper(_Walk):
     def _named(self, value: Any, info: Record, row: FieldRow) -> dict[str, Any] | None:
         names = tuple(field.encode_name for field in info.fields)
         return named_by(value, names, tag_of(info), in_order=is_by_position(info))
+
+
+def may_be_missing(field: inspect.Field) -> bool:
+    """Whether a value may be without it, and has nothing in its place: a key of a `TypedDict` that is `NotRequired`."""
+    return not field.required and field.default is field.default_factory is msgspec.NODEFAULT
 
 
 def sources(info: Record, row: FieldRow) -> Iterator[tuple[inspect.Field, str]]:

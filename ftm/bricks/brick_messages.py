@@ -9,16 +9,13 @@ from ...checkpoint.protocol import (
     Clock,
     Closed,
     Feed,
-    GivenUp,
     Go,
     Hooked,
     Ignored,
     Live,
+    MidTurn,
     PastInputs,
-    Performed,
     PipeDone,
-    Released,
-    Retried,
     Snapshot,
     TurnEnd,
     Unsaved,
@@ -211,7 +208,7 @@ class Outward(Message):
     and what its effects have come to."""
 
     epoch: int
-    records: list[Released | Performed | Retried | GivenUp]
+    records: list[MidTurn]
 
 
 class PartEnded(Message):

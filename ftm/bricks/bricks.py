@@ -25,12 +25,9 @@ from ...checkpoint.protocol import (
     MESSAGE,
     REPLY,
     Answer,
-    GivenUp,
     Live,
+    MidTurn,
     Outcome,
-    Performed,
-    Released,
-    Retried,
     Snapshot,
     TurnEnd,
 )
@@ -453,7 +450,7 @@ class Proceed(Brick):
                     raise self._raised("heard", no) from no
             self._standing.server.inward(record)
 
-    def tell_outward(self, record: Released | Performed | Retried | GivenUp) -> None:
+    def tell_outward(self, record: MidTurn) -> None:
         """Tell a message that the protected actor has let out, if this replica leads and is not fenced."""
         standing = self._standing
         if standing.leads and not standing.is_fenced:

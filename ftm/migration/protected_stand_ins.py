@@ -23,7 +23,7 @@ from ...actors.migration.quiesce import Settle, farewell, obey_commands, part, s
 from ...actors.migration.worker_moves import GuestMove
 from ...actors.process.resource_limits import Limits, limits_data
 from ...actors.process.wire.frames import BadFrame
-from ...actors.process.wire.start_codec import pack_recipe
+from ...actors.process.wire.start_codec import pack_recipe, unpack_recipe
 from ...checkpoint.life.child_stub import ChildPlace, RootHome
 from ...checkpoint.life.recorded_inbox import StopRecorded
 from ...checkpoint.life.recorded_life import HomePort, Life
@@ -38,6 +38,7 @@ from ...checkpoint.protocol import (
     ToHome,
 )
 from ...supervision.respec import replace_mechanism
+from ...supervision.respec import respec as replace_start
 from ..group.transient_homes import UNKEPT
 from ..model.mechanism import Description, compose, revive
 from ..replica.replica_life import NOWHERE
@@ -109,13 +110,17 @@ def child_at_root(guest: Guest, spec: ChildSpec) -> ChildAtRoot:
 
 
 def respec(cell: Cell, said: Respec) -> None:
-    """The next lives of a child have these mechanisms, or live there without one."""
+    """The next lives of a child have these mechanisms, or live there without one; they may begin otherwise, too."""
     layers = tuple(map(revive, msgspec.convert(said.layers, list[Description])))
     mechanism = None if not layers else layers[0] if len(layers) == 1 else layers
     limits = Limits(**said.limits) if said.limits else None
     spec = dataclasses.replace(cell.spec, mechanism=mechanism, isolation=said.isolation, limits=limits)
     # What lasts stands in a recipe at the root; a supervisor that notes its children has none of them in one.
     replace_mechanism(cell, spec, is_lent=True)
+    if said.start:
+        start = unpack_recipe(said.start)
+        cell.table = start.kind._table
+        replace_start(cell, start)
 
 
 # -- lives that are handed over while they are lived -----------------------------------------------------------------

@@ -37,6 +37,7 @@ from ...checkpoint.protocol import (
     Hooked,
     Ignored,
     Live,
+    MidTurn,
     Outcome,
     PastInputs,
     Performed,
@@ -48,6 +49,7 @@ from ...checkpoint.protocol import (
     SnapshotNow,
     ToHome,
     TurnEnd,
+    Unreadable,
     Unsaved,
 )
 from ...checkpoint.snapshot.key_variables import variables
@@ -114,7 +116,7 @@ class Driver(Protocol):
         """See to it that what waits to go home is taken."""
         ...
 
-    def tell_outward(self, record: Released | Performed | Retried | GivenUp) -> None:
+    def tell_outward(self, record: MidTurn) -> None:
         """Something leaves in the middle of a turn."""
         ...
 
@@ -1042,7 +1044,7 @@ class Server(lifecycle.HerePlace):
                     if record.status == FAILED:
                         self.attempts.failed = record.id
                 self.part.ends.append(record)
-            case Released() | Performed() | Retried() | GivenUp():
+            case Released() | Performed() | Retried() | GivenUp() | Unreadable():
                 if self._driver is not None:
                     self._driver.tell_outward(record)
             case Live():

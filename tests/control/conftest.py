@@ -23,6 +23,8 @@ WAYS: dict[str, dict[str, Any]] = {
     "recorded process": {"recovery": hf.hybrid(interval=3600.0), "isolation": "process"},
     "in a subtree": {},
     "recorded in a subtree": {"recovery": hf.hybrid(interval=3600.0)},
+    "process in a subtree": {"isolation": "process"},
+    "recorded process in a subtree": {"recovery": hf.hybrid(interval=3600.0), "isolation": "process"},
 }
 
 Starter = Callable[..., Awaitable[hf.ActorRef[Any]]]

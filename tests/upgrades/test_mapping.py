@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from typing import Any, NamedTuple, TypedDict
+from typing import Any, NamedTuple, NotRequired, TypedDict
 
 import msgspec
 import pytest
@@ -80,6 +80,23 @@ def test_named_tuples_typed_dicts_and_names_that_are_used_again() -> None:
     ]
     old = [1, {"a": 2, "b": 3}, [4, 5], [[6, 7], 8]]
     assert mapped(Mixed, as_shape(rows), old) == Mixed(pair=Pair(5, 4), words={"a": 2}, here=1, two=(Pair(7, 6), 8))
+
+
+class Note(TypedDict):
+    text: str
+    size: NotRequired[int]
+
+
+class Noted(hf.Message):
+    notes: list[Note]
+
+
+def test_a_key_that_need_not_be_there_is_left_out() -> None:
+    older = as_shape([("", True, ("notes",)), ("notes[]", False, ("text",), ("str",))])
+    assert mapped(Noted, older, [[{"text": "a"}]]) == Noted([{"text": "a"}])
+    other = tuple(row._replace(fields=row.fields[::-1], types=row.types[::-1]) for row in shape_of(Noted))
+    for note in (Note(text="a"), Note(text="a", size=1)):
+        assert mapped(Noted, other, unmapped(Noted, other, Noted([note]))) == Noted([note])
 
 
 def test_what_the_newest_program_wrote_has_both_names() -> None:

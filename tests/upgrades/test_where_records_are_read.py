@@ -261,6 +261,59 @@ class A(hf.Actor):
 """
 
 
+MADE = """
+class Kept(msgspec.Struct):
+    x: int
+    y: int = 0
+
+
+class Wait(hf.Message): ...
+
+
+class Tick(hf.Message): ...
+
+
+async def make() -> Kept:
+    return Kept(1)
+
+
+class A(hf.Actor):
+    def __init__(self) -> None:
+        self.parts: list[Any] = []
+
+    @hf.on(Wait)
+    async def wait(self, message: Wait) -> None:
+        made = await self.ctx.effect(make)
+        await self.ctx.wait_for(Tick)
+        self.parts = [made]
+
+    @hf.on(Tick)
+    def tick(self, message: Tick) -> None: ...
+
+    @hf.on(Get)
+    def get(self, message: Get) -> list[Any]:
+        return [repr(part) for part in self.parts]
+"""
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_what_an_effect_has_returned_and_cannot_be_read_waits_for_the_older_program(
+    store: Generations, isolation: Any
+) -> None:
+    """A turn in hand would be over, had its handler got an error in the place of what was returned."""
+    async with store.run(MADE, isolation=isolation) as (system, actor, old):
+        actor.tell(old.Wait())
+        async with asyncio.timeout(LONG):
+            while not any(out for out in system._homes.at("/app/a").ledger.waits.dues):
+                await asyncio.sleep(0.01)
+    with pytest.raises(hf.StartFailed, match=r"what make has returned: .*:Kept has no y"):
+        async with store.run(MADE.replace("    y: int = 0\n", ""), isolation=isolation):
+            pass
+    async with store.run(MADE, isolation=isolation) as (_, actor, old):
+        actor.tell(old.Tick())
+        assert await actor.ask(old.Get(), timeout=LONG) == ["Kept(x=1, y=0)"]
+
+
 async def test_classes_inside_of_a_state(store: Generations) -> None:
     """Fields with defaults are added, and fields are renamed."""
     newer = (
