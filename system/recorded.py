@@ -27,10 +27,15 @@ if TYPE_CHECKING:
 class Recorded:
     """Control of what the homes keep."""
 
-    _homes: Homes
-    """All recorded addresses, for those who change the tree."""
-    _lines: Lines
-    """The lines to other systems."""
+    @property
+    def _homes(self) -> Homes:
+        """All recorded addresses, for those who change the tree."""
+        raise NotImplementedError
+
+    @property
+    def _lines(self) -> Lines:
+        """The lines to other systems."""
+        raise NotImplementedError
 
     def quarantined(self, actor: Target | None = None) -> list[QuarantinedMessage]:
         """Messages put aside because they have ended their actor's process again and again, oldest first.

@@ -118,9 +118,7 @@ def respec(cell: Cell, said: Respec) -> None:
     # What lasts stands in a recipe at the root; a supervisor that notes its children has none of them in one.
     replace_mechanism(cell, spec, is_lent=True)
     if said.start:
-        start = unpack_recipe(said.start)
-        cell.table = start.kind._table
-        replace_start(cell, start)
+        replace_start(cell, unpack_recipe(said.start))
 
 
 # -- lives that are handed over while they are lived -----------------------------------------------------------------
