@@ -25,6 +25,7 @@ KILLING = "tests/checkpoint/test_killing_steps.py"
 SMALL_DISK = "tests/checkpoint/sqlite/test_small_disk.py"
 CLOCKS_SET = "tests/effects/test_clocks_set.py"
 BETWEEN = "tests/checkpoint/test_between_lives.py"
+TIES = "tests/checkpoint/test_ties_of_an_address.py"
 ORDER = "tests/checkpoint/test_order.py"
 REGISTRY = "tests/supervision/test_registry_recorded.py"
 ORDERS = "tests/checkpoint/test_restart_orders.py"
@@ -532,6 +533,20 @@ CHECKS = {
         "release(stopped)",
         BETWEEN,
         "test_an_ask_that_waits_for_room_waits_on",
+    ),
+    "whoever links with one between two lives is linked with the next": Check(
+        "checkpoint/protocol.py",
+        "        return self.goes_on\n",
+        "        return False\n",
+        TIES,
+        "between_two_lives and permanent",
+    ),
+    "a process knows of no links that its actor's home keeps": Check(
+        "actors/process/process_host.py",
+        '        its_own = ("bind",) if self.home.keeps_links else',
+        '        its_own = ("bind",) if False else',
+        TIES,
+        "test_who_is_linked_with_one_that_recovers",
     ),
     "and one that is to be answered later": Check(
         "checkpoint/home/disposal.py",

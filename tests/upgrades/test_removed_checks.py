@@ -202,6 +202,34 @@ CHECKS = {
         BEYOND,
         "test_what_was_tried",
     ),
+    "a supervisor elsewhere hears of its child's class": Check(
+        "supervision/respec.py",
+        "    cell.host.parent.begins_with(cell, start)\n",
+        "",
+        CODE,
+        "process",
+    ),
+    "senders are refused by the class of the next lives": Check(
+        "supervision/respec.py",
+        "        cell.table = start.kind._table  # Who sends",
+        "        pass  # Who sends",
+        CODE,
+        "process",
+    ),
+    "a turn in hand waits for whoever can read its effect": Check(
+        "checkpoint/life/recorded_life.py",
+        "            if isinstance(awaited, EffectCall):  # It was read",
+        "            if False:  # It was read",
+        READ,
+        "what_an_effect_has_returned",
+    ),
+    "a key that need not be there is left out": Check(
+        "checkpoint/upgrade/mapping.py",
+        "            elif not may_be_missing(field):\n",
+        "            else:\n",
+        MAPPING,
+        "key_that_need_not",
+    ),
 }
 
 test_the_table_is_true, test_without_the_check_a_test_fails = as_tests(CHECKS)
