@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import dataclasses
 import functools
 import hashlib
 import types
@@ -76,12 +75,24 @@ class KeptHandle(SavedHandle):
         return f"{type(self).__name__}(id={self.id!r})"
 
 
-@dataclasses.dataclass(slots=True, eq=False, repr=False)
 class RecordedReplyHandle(KeptHandle, ReplyHandle[R]):
-    """The right to answer one ask of a recorded actor later."""
+    """The right to answer one ask of a recorded actor later. (No dataclass: a message could take it along.)"""
+
+    __slots__ = ("_asked",)
 
     id: int
-    asked: str = ""  # the name of the message; one that was saved by an earlier version has none
+
+    def __init__(self, id: int, asked: str = "") -> None:
+        super().__init__(id)
+        self._asked = asked
+
+    @property
+    def asked(self) -> str:
+        """The name of the message that was asked."""
+        try:
+            return self._asked
+        except AttributeError:  # It was saved by an earlier version.
+            return ""
 
     def reply(self, value: R) -> None:
         life = _own_life("answers later")
