@@ -57,9 +57,11 @@ async def test_without_draining_what_is_queued_is_not_handled(
     queued = one.ask(Add(1), timeout=30.0)
     await until_there(tmp_path / "gate.begun")
     stopping = asyncio.create_task(system.stop(one))
+    above = system.ref(one.path.rpartition("/")[0], hf.Supervisor)
     for _ in range(5):  # These answers come behind the stop, wherever the supervisor is.
-        assert (await system.get_status(one)).turn is not None
         await asyncio.sleep(0)
+        await above.ask(hf.WhichChildren(), 20.0)
+        assert (await system.get_status(one)).turn is not None
     gate.touch()
     await stopping
     assert await waiting == "waited"
