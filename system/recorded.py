@@ -27,15 +27,10 @@ if TYPE_CHECKING:
 class Recorded:
     """Control of what the homes keep."""
 
-    @property
-    def _homes(self) -> Homes:
-        """All recorded addresses, for those who change the tree."""
-        raise NotImplementedError
-
-    @property
-    def _lines(self) -> Lines:
-        """The lines to other systems."""
-        raise NotImplementedError
+    _homes: Homes
+    """All recorded addresses, for those who change the tree."""
+    _lines: Lines
+    """The lines to other systems."""
 
     def quarantined(self, actor: Target | None = None) -> list[QuarantinedMessage]:
         """Messages put aside because they have ended their actor's process again and again, oldest first.

@@ -80,7 +80,9 @@ if TYPE_CHECKING:
     from opentelemetry.trace import Tracer
 
 A = TypeVar("A", bound=Actor)
-P = TypeVar("P")
+
+MADE_WITH_NODE = ("_homes", "_lines", "_specifications", "_mechanism_notes")
+"""Parts that a system has once it is entered."""
 
 ENTRY = f"{__package__}.worker_main:main"
 BASE = (f"{__package__}.worker_main",)
@@ -189,8 +191,6 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
         self._sink: LogSink | None = None
         self._history: HistoryRecorder | None = None
         self._running: Node | None = None
-        self._open_homes: Homes | None = None
-        self._open_lines: Lines | None = None
         self._root: Cell | None = None
         self._body: asyncio.Task[Any] | None = None
         self._closing: asyncio.Task[None] | None = None
@@ -576,30 +576,20 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
     @property
     def _node(self) -> Node:
         """The node that hosts this process's actors."""
-        return self._part_of_run(self._running)
+        if self._running is None:
+            raise self._not_running()
+        return self._running
 
-    @property
-    def _homes(self) -> Homes:
-        """All recorded addresses, for those who change the tree."""
-        return self._part_of_run(self._open_homes)
+    def _not_running(self) -> HoldfastError:
+        return HoldfastError(f"system {self.name!r} is not running: use it in `async with`")
 
-    @_homes.setter
-    def _homes(self, homes: Homes) -> None:
-        self._open_homes = homes
+    if not TYPE_CHECKING:  # It would hide misspelt names.
 
-    @property
-    def _lines(self) -> Lines:
-        """The lines to other systems."""
-        return self._part_of_run(self._open_lines)
-
-    @_lines.setter
-    def _lines(self, lines: Lines) -> None:
-        self._open_lines = lines
-
-    def _part_of_run(self, part: P | None) -> P:
-        if part is None:
-            raise HoldfastError(f"system {self.name!r} is not running: use it in `async with`")
-        return part
+        def __getattr__(self, name: str) -> Any:
+            """Of the parts that come when the system is entered, say that it was not."""
+            if name in MADE_WITH_NODE:
+                raise self._not_running()
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}", name=name, obj=self)
 
     def from_thread(self) -> ThreadPortal:
         """Return a handle for other threads, such as those in which a web framework runs its plain `def` endpoints."""

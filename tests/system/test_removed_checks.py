@@ -60,6 +60,13 @@ SETTERS = "tests/checkpoint/test_own_setters.py"
 DECLARED = "tests/supervision/test_declared_classes.py"
 
 CHECKS = {
+    "what a system lacks before it is entered says so": Check(
+        "system/system.py",
+        "            if name in MADE_WITH_NODE:\n",
+        "            if False:\n",
+        "tests/system/test_system.py",
+        "not_entered_says_so",
+    ),
     "a class of arrays does not get lost": Check(
         "actors/kernel/codec.py",
         '    raise TypeError(f"a {type_name(kind)} would arrive as a plain array; send numpy.asarray(...) of it")\n',
