@@ -275,6 +275,22 @@ def check_reason(where: str, reason: object) -> ExitReason:
     return reason
 
 
+def check_farewell(given: ExitReason, reason: ExitReason) -> None:
+    """Whether `on_stop` may end a life for this reason, where it was `given` another one.
+
+    What something else than the life itself has done to it, such as a kill, can only be passed on: a supervisor that
+    heard of a kill would bring the life back, to end again.
+
+    Raises:
+        SpecError: it may not, and what to return instead.
+    """
+    check_reason("on_stop", reason)
+    if reason != given and not reason.is_clean and not isinstance(reason, Crash):
+        raise SpecError(
+            "on_stop", f"returns {reason}, which did not end it: return hf.Shutdown('TEXT'), or raise to end by a crash"
+        )
+
+
 def _hint(reason: object) -> str:
     match reason:
         case ExitReason() if type(reason).__module__ != __name__:

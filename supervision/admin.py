@@ -12,7 +12,7 @@ from ..actors.kernel.codec import Packable, Packed
 from ..actors.kernel.message import Message, Refusal, RuntimeCall, RuntimeOrder
 from ..actors.kernel.node import Node
 from ..actors.kernel.ref import ActorRef
-from ..actors.process.wire.start_codec import pack_data, unpack_data
+from ..actors.process.wire.start_codec import pack_argument, pack_data, unpack_argument, unpack_data
 
 # -- refusals -------------------------------------------------------------------------------------------------------
 
@@ -131,6 +131,38 @@ def opened(value: Any, node: Node) -> Any:
         raise SpecError("supervisor", str(error)) from error
 
 
+class BoxedArgument(Boxed):
+    """A value in a message of which nothing declares the type: its bytes say it."""
+
+    __slots__ = ()
+
+    def packed(self) -> bytes:
+        return pack_argument(self.value, "argument")
+
+
+AS_THEY_ARE = (type(None), bool, int, float, str, bytes, ActorRef)
+"""What arrives as it was sent, whatever declares it."""
+
+
+def boxed_argument(value: Any) -> Any:
+    """A value whose type nothing declares, so that it arrives as what it is."""
+    return value if type(value) in AS_THEY_ARE or isinstance(value, (Boxed, Packed)) else BoxedArgument(value)
+
+
+def opened_argument(value: Any, node: Node) -> Any:
+    """The value that is in a box. From another process than the root only classes are made that are loaded here.
+
+    Raises:
+        SpecError: a class of it cannot be found here.
+    """
+    if not isinstance(value, Packed):
+        return value.value if isinstance(value, Boxed) else value
+    try:
+        return unpack_argument(value.data, node.ref_at, imports=node.ports.uplink is not None)
+    except HoldfastError as error:
+        raise SpecError("supervisor", f"an argument cannot be read here: {error}") from error
+
+
 class StartChild(RuntimeOrder[Any]):
     """Start one more child; the reply is its ref, or None if it did not want to be started (`Ignore`).
 
@@ -151,7 +183,17 @@ class StartChild(RuntimeOrder[Any]):
     unless_stopped: bool = False
 
     def __post_init__(self) -> None:
-        msgspec.structs.force_setattr(self, "spec", boxed(self.spec))
+        set_field = msgspec.structs.force_setattr
+        set_field(self, "spec", boxed(self.spec))
+        if isinstance(self.args, (tuple, list)):
+            set_field(self, "args", tuple(map(boxed_argument, self.args)))
+        if isinstance(self.kwargs, dict):
+            set_field(self, "kwargs", {name: boxed_argument(value) for name, value in self.kwargs.items()})
+
+    def arguments(self, node: Node) -> tuple[tuple[Any, ...], dict[str, Any]]:
+        """What is given to the actor besides the template's own. Raises SpecError if it cannot be read here."""
+        named = {name: opened_argument(value, node) for name, value in self.kwargs.items()}
+        return tuple(opened_argument(value, node) for value in self.args), named
 
 
 class TerminateChild(RuntimeOrder[None]):

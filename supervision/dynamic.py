@@ -303,7 +303,7 @@ class DynamicSupervisor(Supervisor):
         elif self._template is not None:
             if given is not None:
                 raise SpecError("StartChild", f"{self.ctx.path} has a template: give args and kwargs only")
-            spec = filled(self._template, message.args, message.kwargs)
+            spec = filled(self._template, *message.arguments(own.node))
         elif message.args or message.kwargs:
             raise SpecError("StartChild", f"{self.ctx.path} has no template for these arguments: give a child spec")
         elif isinstance(given, Start):

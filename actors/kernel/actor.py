@@ -215,7 +215,8 @@ class Actor:
         """Called last, at every end in good order and after a crash; may be async.
 
         Not called when the life is killed, when its start failed, or when an EXIT ends it that it does not trap. If it
-        returns an exit reason, that becomes the life's own; if it raises, so does the crash, unless there was one.
+        returns an exit reason (a clean one, a `Crash`, or the one that it was given), that becomes the life's own; if
+        it raises, so does the crash, unless there was one.
         """
 
     def on_exit(self, source: ActorRef[Any], reason: ExitReason) -> Any:

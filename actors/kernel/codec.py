@@ -251,21 +251,35 @@ class Codec:
     ) -> HoldfastError:
         """The error by which `actor` has answered `message`; if it is none that can be made here, that is said."""
         try:
-            return self._decode_error(kind, name, body)
+            made = self._decode_error(kind, name, body)
+            if made is not None:
+                return made
+            args = self.decode(list[Any], body)
         except Exception as error:  # It is made of what another process says: the parameters need not fit.
             return BadReply(actor, message, f"an error ({name or kind}) that cannot be made: {error_text(error)}")
+        if kind == "refusal":
+            return UnknownRefusal(type_name=name, fields=args)
+        return AskFailed(name, ", ".join(map(str, args)))
 
-    def _decode_error(self, kind: str, name: str, body: Any) -> HoldfastError:
+    def decode_own_error(self, kind: str, name: str, body: bytes) -> HoldfastError:
+        """The error that `encode_own_error` was given, and no other. What it raises says why that cannot be made."""
+        made = self._decode_error(kind, name, body)
+        if made is None:
+            raise LookupError(f"{name} is not loaded")
+        return made
+
+    def _decode_error(self, kind: str, name: str, body: Any) -> HoldfastError | None:
+        """The error, or None if its class is not loaded here."""
         if kind == "refusal":
             found = find_refusal(name)
             if found is None:
-                return UnknownRefusal(type_name=name, fields=self.decode(list[Any], body))
+                return None
             fields = self.decode(found.schema(), body)
             return found(*(getattr(fields, field) for field in fields.__struct_fields__))
         args: tuple[Any, ...] = tuple(tuple(a) if type(a) is list else a for a in self.decode(list[Any], body))
         if kind == "crash":
             return RemoteCrash(*args)
-        return rebuild_error(name, args) or AskFailed(name, ", ".join(map(str, args)))
+        return rebuild_error(name, args)
 
 
 def known_at(cell: Cell) -> str:

@@ -486,7 +486,7 @@ async def _farewell(cell: Cell, end: End, says: bool) -> None:
         if asyncio.iscoroutine(result):
             result = await result
         if isinstance(result, ExitReason):
-            exit_reasons.check_reason("on_stop", result)
+            exit_reasons.check_farewell(end.reason, result)
     except BaseException as error:  # A failing hook must not keep the end from being told.
         result = exit_reasons.crash(error)
         cell.node.emit(HookFailed(cell.path, "on_stop", result))

@@ -456,7 +456,7 @@ class JournalHome(RecordedHome):
             if switch.life.port is None:
                 return  # As above.
         except HoldfastError as error:
-            if not isinstance(error, StartIgnored):
+            if entered.recovering and not isinstance(error, StartIgnored):  # Else there was nothing to recover.
                 node.emit(RecoveryFailed(cell.path, str(error)))
             raise error if isinstance(error, StartFailed) else StartFailed(cell.path, str(error)) from error
         except asyncio.CancelledError:

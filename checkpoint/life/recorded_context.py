@@ -579,7 +579,9 @@ class RecordedContext(ActorContext):
         text = error_text(error)
         try:
             if isinstance(error, HoldfastError):
-                return Answer(*self._cell.node.codec.encode_own_error(error))
+                kept = self._cell.node.codec.encode_own_error(error)
+                self._cell.node.codec.decode_own_error(*kept)
+                return Answer(*kept)
         except Exception as problem:  # It has fields of the user's own, of whatever types.
             text = f"what it has raised cannot be kept: {error_text(problem)}"
         return self.recorded.answer_error(EffectFailed(effect.key, 1, type_name(type(error)), text))

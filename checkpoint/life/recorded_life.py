@@ -81,7 +81,7 @@ from ..turn_word import OVER, TurnWord
 from .determinism_guard import DeterminismGuard
 from .glances import answer_beside
 from .life_state import Asked, Awaited, LifeStage, LifeTimers, LifeWaits, RestoredState, SnapshotState
-from .outcome_order import OutcomeOrder, is_given_up
+from .outcome_order import STEPS, OutcomeOrder, is_given_up
 from .readonly_guard import check_readonly
 from .recorded_context import Pending, RecordedContext, RecordedReplyHandle
 from .recorded_inbox import INIT, STOP, Fed, GoLive, Hook, StopRecorded, TakeSnapshot
@@ -280,7 +280,7 @@ class Life:
         waits = self.waits
         waits.heard += 1
         if self.stage.begun >= 0:
-            self.cell.node.loop.call_soon(self.say_it_waits)  # Behind the turn, if that has waited for this.
+            self._say_it_waits_in(STEPS)  # Behind the turn, if that has waited for this.
         future, awaited = waits.outcomes.get((record.turn, record.k), (None, None))
         if future is None or (is_given_up(record) and not future.done()):
             return False
@@ -295,11 +295,10 @@ class Life:
             if answer.kind in (REPLY, MESSAGE, MOMENT):
                 future.set_result(self._result(answer, awaited))
             else:
-                error = self.cell.node.codec.decode_error(answer.kind, answer.name, answer.body, *self._asked(awaited))
-                future.set_exception(error)
+                future.set_exception(self._error(answer, awaited))
         except Exception as error:
             if isinstance(awaited, EffectCall):  # It was read before it counted, so its class has changed since.
-                why = f"what {awaited.key} has returned: {error}"
+                why = f"what {awaited.key} has ended with: {error}"
                 self.port.to_home(Unreadable(record.turn, record.k, why))
             else:
                 future.set_exception(BadReply(*self._asked(awaited), str(error)))
@@ -321,6 +320,13 @@ class Life:
             return decode_value(answer.body, refs=self.cell.node.ref_at)
         kind = next(kind for kind in awaited if message_name(kind) == answer.name)
         return self.cell.node.codec.decode(kind, answer.body)
+
+    def _error(self, answer: Answer, awaited: Awaited) -> HoldfastError:
+        """What is raised where a turn has waited."""
+        codec = self.cell.node.codec
+        if isinstance(awaited, EffectCall):  # Its handler may know the very class.
+            return codec.decode_own_error(answer.kind, answer.name, answer.body)
+        return codec.decode_error(answer.kind, answer.name, answer.body, *self._asked(awaited))
 
     def _perform(self, order: Perform) -> None:
         """An effect of the turn in hand has no outcome yet."""
@@ -379,6 +385,13 @@ class Life:
         finally:
             if waits and self.word is not None:
                 self.word.mark(OVER if self.feed is None else self.waits.how(self.turn))
+
+    def _say_it_waits_in(self, steps: int) -> None:
+        """As `say_it_waits`, after so many steps of the loop, in which the turn may go on."""
+        if steps:
+            self.cell.node.loop.call_soon(self._say_it_waits_in, steps - 1)
+        else:
+            self.say_it_waits()
 
     def say_it_waits(self) -> None:
         """Say that the turn which had begun in an earlier life does not get on by itself, or does not begin."""

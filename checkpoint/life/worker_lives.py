@@ -20,6 +20,7 @@ from ..addresses import AddressTree
 from ..method import Method
 from ..protocol import (
     Begin,
+    Ignored,
     Over,
     Respec,
     Restore,
@@ -299,6 +300,8 @@ class ChildHere(ChildPlace):
             port.begin(life, record.turn, record.stash)
         except StartFailed as error:  # Told of here, with its reason.
             port.life = None
+            if isinstance(error, StartIgnored):
+                port.to_home(Ignored(error.reason))
             self.fail(error)
             self.say_closed(cell, cell.extra().reason)
         else:

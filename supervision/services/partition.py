@@ -8,6 +8,8 @@ import os
 from collections.abc import Callable
 from typing import Any, ClassVar
 
+import msgspec
+
 from ...actors.errors import HoldfastError, SpecError
 from ...actors.exit_reasons import SHUTDOWN
 from ...actors.kernel.actor import Start, on
@@ -16,7 +18,15 @@ from ...actors.kernel.message import Message, RuntimeCall, RuntimeOrder
 from ...actors.kernel.ref import ActorRef
 from ...actors.process.resource_limits import Limits
 from ...actors.values import state_digest
-from ..admin import DeleteChild, NoPartitions, NotSupported, RemoveChild, StartChild
+from ..admin import (
+    DeleteChild,
+    NoPartitions,
+    NotSupported,
+    RemoveChild,
+    StartChild,
+    boxed_argument,
+    opened_argument,
+)
 from ..children import STOPPED, Child
 from ..spec import ChildSpec, Isolation, Plan, Restart, Shutdown, Strategy, check_spec, child
 from ..supervisor import Supervisor
@@ -28,6 +38,9 @@ class Route(RuntimeCall[ActorRef[Any]]):
     """Ask which partition a key belongs to; the reply is a ref to that partition."""
 
     key: Any
+
+    def __post_init__(self) -> None:  # Another process has to find the same partition.
+        msgspec.structs.force_setattr(self, "key", boxed_argument(self.key))
 
 
 class CountPartitions(Message[int]):
@@ -131,7 +144,7 @@ class PartitionSupervisor(UniformSupervisor):
         if not self._now:
             raise NoPartitions(self.ctx.path)
         try:
-            number = partition_of(message.key, self._now)
+            number = partition_of(opened_argument(message.key, self.ctx._cell.node), self._now)
         except HoldfastError as error:
             return self._fail(error)
         return self.ctx._cell.node.cell_at(f"{self.ctx.path}/{number}").ref

@@ -112,6 +112,7 @@ class NewProgram:
         self._mechanisms = MechanismNotes(homes)
         self._found: dict[str, ChildSpec] = {}
         self._unasked: dict[str, str] = {}
+        self._lost: dict[str, str] = {}
         self._dynamic: dict[str, Plan] = {}
         named = {address: spec for address, spec in specs.items() if address.count("/") > 1}
         for system in {address.split("/")[1] for address in homes.known("")}:
@@ -161,15 +162,17 @@ class NewProgram:
                 continue
             try:
                 self._take(f"{path}/{name}", unpack_noted(path, template, name, data)[0])
-            except HoldfastError as error:
-                self._unasked[f"{path}/{name}"] = str(error)
+            except HoldfastError as error:  # So will its supervisor find it: nobody is started there.
+                self._lost[f"{path}/{name}"] = str(error)
 
     def recipe(self, path: str) -> Recipe | AddressCheck:
         """How the new program starts the actor at an address, or what is to be said if it does not."""
         spec = self._found.get(path) or self._started_later(path)
         if spec is None:
-            above = next((one for one in self._unasked if path == one or path.startswith(f"{one}/")), None)
-            if above is not None:
+            if (above := _at_or_above(path, self._lost)) is not None:
+                why = f"{above} would not be started, since what is noted of it cannot be read: {self._lost[above]}"
+                return AddressCheck(path, "refused", problem=why)
+            if (above := _at_or_above(path, self._unasked)) is not None:
                 return AddressCheck(path, "unchecked", problem=f"{above} could not be asked: {self._unasked[above]}")
             if (supervisor := self._forgotten_by(path)) is not None:
                 why = f"{supervisor} has forgotten it, as whoever has ended in good order, and starts nobody there"
@@ -187,7 +190,7 @@ class NewProgram:
         template = (
             self._dynamic[above].children[0] if above in self._dynamic and self._dynamic[above].children else None
         )
-        if template is None or path in self._unasked:
+        if template is None or path in self._lost:
             return None
         try:
             template.start.check()
@@ -204,3 +207,8 @@ class NewProgram:
             if above in self._dynamic and child not in self._found:
                 return above if self._dynamic[above].flags.journal else None
         return None
+
+
+def _at_or_above(path: str, addresses: Iterable[str]) -> str | None:
+    """The one of these addresses that is this one, or above it."""
+    return next((one for one in addresses if path == one or path.startswith(f"{one}/")), None)

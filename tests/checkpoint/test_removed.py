@@ -2187,6 +2187,13 @@ CHECKS = {
         CHUNKS_KEPT,
         "test_what_little_has_changed and memory and task-0",
     ),
+    "a first start that has failed is no recovery": Check(
+        "checkpoint/home/journal_home.py",
+        "            if entered.recovering and not isinstance(error, StartIgnored):",
+        "            if not isinstance(error, StartIgnored):",
+        "tests/supervision/test_ignore.py",
+        "test_a_first_start_that_is_refused and raise",
+    ),
 }
 
 test_the_table_is_true, test_without_the_check_a_test_fails = as_tests(CHECKS)

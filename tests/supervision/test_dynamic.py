@@ -1,9 +1,12 @@
 """Dynamic supervisors (otp.md 1.14 DynamicSupervisor; 1.1 to 1.9 simple_one_for_one)."""
 
 import asyncio
+import dataclasses
+import enum
 import re
 from typing import Any
 
+import msgspec
 import pytest
 
 import holdfast as hf
@@ -414,6 +417,86 @@ async def test_an_actor_in_a_process_starts_from_a_template_but_sends_no_code() 
         pool = await system.start(hf.dynamic("pool", template=hf.child(None, hf.start(Adder))))
         system.bind(boss, "pool", pool)
         assert await boss.ask(Hire(pool, "args")) == "/app/pool/w 3"
+
+
+@dataclasses.dataclass(frozen=True)
+class Place:
+    row: int
+
+
+class Seat(msgspec.Struct, frozen=True):
+    number: int
+    place: Place
+
+
+class Colour(enum.Enum):
+    RED = "r"
+
+
+class Tell(hf.Message[str]): ...
+
+
+class Given(hf.Actor):
+    """Says what it was given."""
+
+    def __init__(self, *given: Any, **named: Any) -> None:
+        self.given, self.named = given, named
+
+    @hf.on(Tell)
+    def tell(self, message: Tell) -> str:
+        return repr((self.given, self.named))
+
+
+class Bring(hf.Message[str]):
+    to: hf.ActorRef[hf.Actor]
+    what: str
+
+
+ARGUMENTS: dict[str, Any] = {
+    "struct": Seat(1, Place(2)),
+    "dataclass": Place(3),
+    "enum": Colour.RED,
+    "tuple": (1, ("a", b"b")),
+    "set": {4},
+    "list": [Place(5)],
+    "dict": {(1, 2): 3.0},
+}
+
+
+class Bringer(hf.Actor):
+    pool: hf.Binding[hf.Supervisor]
+
+    @hf.on(Bring)
+    async def bring(self, message: Bring) -> str:
+        value = ARGUMENTS[message.what]
+        ref = await message.to.ask(hf.StartChild(args=(value,), kwargs={"it": value}))
+        return await ref.ask(Tell())
+
+
+@pytest.mark.parametrize("whose", ["task", "process"])
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_the_arguments_of_a_start_arrive_as_what_they_are(isolation: Any, whose: Any) -> None:
+    template = hf.child(None, hf.start(Given))
+    async with hf.ActorSystem(log=False) as system:
+        pool = await system.start(hf.dynamic("pool", template=template, isolation=isolation))
+        bringer = hf.child("bringer", hf.start(Bringer), isolation=whose, bindings={"pool": pool.path})
+        brings = await system.start(bringer)
+        for name, value in ARGUMENTS.items():
+            wanted = repr(((value,), {"it": value}))
+            assert await (await pool.ask(hf.StartChild(args=(value,), kwargs={"it": value}))).ask(Tell()) == wanted
+            assert await brings.ask(Bring(pool, name)) == wanted
+        of_refs = await pool.ask(hf.StartChild(args=((brings, [pool]),)))
+        assert await of_refs.ask(Tell()) == repr((((brings, [pool]),), {}))
+
+
+async def test_arguments_of_a_start_that_cannot_be_sent_are_refused_where_they_are_sent() -> None:
+    async with hf.ActorSystem(log=False) as system:
+        pool = await system.start(hf.dynamic("pool", template=hf.child(None, hf.start(Given)), isolation="process"))
+        with pytest.raises(
+            hf.errors.BadMessage, match=r"field 'args': argument\[1\]: a value of type object cannot be saved"
+        ):
+            await pool.ask(hf.StartChild(args=([1, object()],)))
+        assert await pool.ask(hf.WhichChildren()) == []
 
 
 BEGUN: list[int] = []

@@ -3,7 +3,7 @@
 import pytest
 
 import holdfast as hf
-from holdfast.supervision.spec import Restart
+from holdfast.supervision.spec import Isolation, Restart
 from tests.supervision.family import Boom, Family, Kid, Plan, kid
 
 LATE = pytest.mark.parametrize("late", [False, True], ids=["__init__", "on_start"])
@@ -160,3 +160,39 @@ async def test_it_works_alike_in_a_subtree_in_a_process(where: str) -> None:
         assert [(info.id, info.state) for info in infos] == [("picky", "stopped"), ("good", "running")]
         lazy = hf.child("lazy", hf.start(Lazy), isolation="process", restart="temporary")
         assert await system.start(lazy) is None
+
+
+class Refuses(hf.Actor):
+    def __init__(self, where: str, error: str) -> None:
+        self.where, self.error = where, error
+        self.at("__init__")
+
+    def on_start(self, restored: bool) -> None:
+        self.at("on_start")
+
+    def at(self, where: str) -> None:
+        if where == self.where:
+            raise hf.Ignore("no device") if self.error == "ignore" else ValueError("no device")
+
+
+@pytest.mark.parametrize("error", ["ignore", "raise"])
+@pytest.mark.parametrize("where", ["__init__", "on_start"])
+@pytest.mark.parametrize("isolation", ["task", "process"])
+@pytest.mark.parametrize("above", ["task", "process"])
+async def test_a_first_start_that_is_refused_is_no_recovery_that_has_failed(
+    above: Isolation, isolation: Isolation, where: str, error: str
+) -> None:
+    async with hf.ActorSystem(log=False) as system:
+        top = await system.start(hf.dynamic("top", isolation=above))
+        spec = hf.child("x", hf.start(Refuses, where, error), isolation=isolation, recovery=hf.hybrid())
+        with system.events() as events:
+            if error == "ignore":
+                assert await top.ask(hf.StartChild(spec)) is None
+            else:
+                with pytest.raises(hf.StartFailed, match="ValueError: no device"):
+                    await top.ask(hf.StartChild(spec))
+            await system._node.settled()
+            told = events.take()
+        assert not [event for event in told if isinstance(event, hf.events.RecoveryFailed)]
+        failed = [event for event in told if isinstance(event, hf.events.ChildStartFailed)]
+        assert len(failed) == (error == "raise")

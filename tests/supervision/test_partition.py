@@ -156,6 +156,9 @@ async def test_partitions_in_processes_and_in_one_process() -> None:
         assert [await ref.ask(Add(1)) for ref in refs] == [1, 1]
         assert len({system.pid_of(ref) for ref in refs} | {os.getpid()}) == 3
         together = await begin(system, 3, isolation="process")
+        for key in ((1, "a"), [1, "a"], frozenset({2}), "a"):
+            found = await together.ask(hf.supervision.Route(key))
+            assert found.path == f"/app/top/{hf.supervision.partition_of(key, 3)}"
         ref = await together.ask(hf.supervision.Route(4))
         assert (ref.path, await ref.ask(Add(1))) == ("/app/top/1", 101)
         assert await together.ask(hf.supervision.ResizePartitions(1)) == 3

@@ -2030,6 +2030,34 @@ CHECKS = {
         "tests/system/test_held_meanwhile.py",
         "isolate",
     ),
+    "an argument of a start arrives as what it is": Check(
+        "supervision/admin.py",
+        'set_field(self, "args", tuple(map(boxed_argument, self.args)))',
+        "pass",
+        "tests/supervision/test_dynamic.py",
+        "test_the_arguments_of_a_start and process",
+    ),
+    "a key arrives as what it is": Check(
+        "supervision/services/partition.py",
+        'msgspec.structs.force_setattr(self, "key", boxed_argument(self.key))',
+        "pass",
+        "tests/supervision/test_partition.py",
+        "test_partitions_in_processes",
+    ),
+    "a child whose own arguments cannot be read is refused before it is missed": Check(
+        "system/upgrade/new_program.py",
+        "            if (above := _at_or_above(path, self._lost)) is not None:\n",
+        "            if False:\n",
+        "tests/system/upgrade/test_check_upgrade.py",
+        "test_a_child_whose_own_arguments",
+    ),
+    "a hook cannot say that something else has ended the life": Check(
+        "actors/exit_reasons.py",
+        "    if reason != given and not reason.is_clean and not isinstance(reason, Crash):\n",
+        "    if False:\n",
+        WRONG,
+        "test_a_hook_cannot_say",
+    ),
 }
 
 test_the_table_is_true, test_without_the_check_a_test_fails = as_tests(CHECKS)

@@ -67,6 +67,36 @@ async def test_a_hook_that_returns_a_wrong_reason_has_failed(recovery: Any) -> N
         assert "on_stop: takes an exit reason" in ended.text
 
 
+class Over(hf.Message): ...
+
+
+class Passes(hf.Actor):
+    @hf.on(Over)
+    def over(self, message: Over) -> None:
+        self.ctx.stop()
+
+    def on_stop(self, reason: hf.ExitReason) -> hf.ExitReason:
+        return hf.KILLED
+
+
+@pytest.mark.asyncio(loop_factories=["uvloop"])
+@pytest.mark.parametrize("isolation", ["task", "process"])
+@pytest.mark.parametrize("recovery", [None, hf.hybrid()], ids=["plain", "recorded"])
+async def test_a_hook_cannot_say_that_something_else_has_ended_the_life(recovery: Any, isolation: Any) -> None:
+    """Whoever hears of a kill brings a recorded life back, to end again, and that again and again."""
+    async with hf.ActorSystem(log=False) as system:
+        passes = hf.child("x", hf.start(Passes), restart="transient", recovery=recovery, isolation=isolation)
+        one = await system.start(passes)
+        with system.events() as events:
+            one.tell(Over())
+            failed = await events.until(hf.events.HookFailed)
+            assert "on_stop: returns killed, which did not end it" in str(failed.reason)
+            while (await events.until(hf.events.ActorStarted)).address != one.path:
+                pass  # As after any crash: it is transient.
+        await system._node.settled()
+        assert (await system.get_status(one)).life == 2
+
+
 class Slow(Idle):
     async def on_stop(self, reason: hf.ExitReason) -> None:
         await asyncio.sleep(4.0)

@@ -230,6 +230,20 @@ CHECKS = {
         MAPPING,
         "key_that_need_not",
     ),
+    "the error of an effect is the one that was raised": Check(
+        "checkpoint/life/recorded_life.py",
+        "        if isinstance(awaited, EffectCall):  # Its handler may know the very class.\n",
+        "        if False:\n",
+        READ,
+        "test_what_effects_have_ended_with and gone",
+    ),
+    "a turn is not as far as it was while it acts on an outcome": Check(
+        "checkpoint/life/recorded_life.py",
+        "            self._say_it_waits_in(STEPS)",
+        "            self._say_it_waits_in(0)",
+        READ,
+        "test_what_effects_have_ended_with and error",
+    ),
 }
 
 test_the_table_is_true, test_without_the_check_a_test_fails = as_tests(CHECKS)

@@ -102,7 +102,7 @@ async def test_a_message_that_a_turn_has_waited_for(store: Generations, isolatio
         actor.tell(old.Wait())
         actor.tell(old.Tick(5, "came"))
         async with asyncio.timeout(LONG):
-            while not any(out for out in system._homes.at("/app/a").ledger.waits.dues):
+            while not any(k > 1 for _, k in system._homes.at("/app/a").ledger.waits.dues):
                 await asyncio.sleep(0.01)
         actor.tell(old.Add(6, "behind"))
         await asyncio.sleep(0.05)
@@ -304,14 +304,108 @@ async def test_what_an_effect_has_returned_and_cannot_be_read_waits_for_the_olde
     async with store.run(MADE, isolation=isolation) as (system, actor, old):
         actor.tell(old.Wait())
         async with asyncio.timeout(LONG):
-            while not any(out for out in system._homes.at("/app/a").ledger.waits.dues):
+            while not any(k > 1 for _, k in system._homes.at("/app/a").ledger.waits.dues):
                 await asyncio.sleep(0.01)
-    with pytest.raises(hf.StartFailed, match=r"what make has returned: .*:Kept has no y"):
+    with pytest.raises(hf.StartFailed, match=r"what make has ended with: .*:Kept has no y"):
         async with store.run(MADE.replace("    y: int = 0\n", ""), isolation=isolation):
             pass
     async with store.run(MADE, isolation=isolation) as (_, actor, old):
         actor.tell(old.Tick())
         assert await actor.ask(old.Get(), timeout=LONG) == ["Kept(x=1, y=0)"]
+
+
+RAISED = """
+from typing import Any
+
+import holdfast as hf
+import msgspec
+
+
+class Kept(msgspec.Struct):
+    x: int
+    y: int = 0
+
+
+async def make() -> Kept:
+    return Kept(1)
+
+
+class Get(hf.Message[list[Any]]): ...
+
+
+class Wait(hf.Message): ...
+
+
+class Tick(hf.Message): ...
+
+
+class NoSeat(hf.errors.Refusal, text="no seat in row {row}"):
+    row: int
+
+
+class Closed(hf.HoldfastError, text="{what} is closed"):
+    what: str
+
+
+async def seat() -> None:
+    raise NoSeat(3)
+
+
+async def shop() -> None:
+    raise Closed("the shop")
+
+
+class A(hf.Actor):
+    def __init__(self) -> None:
+        self.parts: list[str] = []
+
+    @hf.on(Wait)
+    async def wait(self, message: Wait) -> None:
+        said = []
+        for one in (seat, shop):
+            try:
+                await self.ctx.effect(one)
+            except hf.HoldfastError as error:
+                said.append(repr(error))
+        said.append(repr(await self.ctx.effect(make)))
+        await self.ctx.wait_for(Tick)
+        self.parts = said
+
+    @hf.on(Tick)
+    def tick(self, message: Tick) -> None: ...
+
+    @hf.on(Get)
+    def get(self, message: Get) -> list[Any]:
+        return list(self.parts)
+"""
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (("NoSeat", "NoPlace"), r"seat has ended with: .*:NoSeat is not loaded"),
+        (("    y: int = 0\n", ""), r"make has ended with: .*:Kept has no y"),
+        (("row", "place"), r"the refusal upgraded:NoSeat is in its journal: .*place is new"),
+        (("Closed", "Shut"), r"shop has ended with: .*\.Closed is not loaded"),
+    ],
+    ids=["refusal gone", "field of a value", "field of a refusal", "error gone"],
+)
+async def test_what_effects_have_ended_with_and_cannot_be_read_waits_for_the_older_program(
+    store: Generations, change: tuple[str, str], said: str
+) -> None:
+    """In a process, where no class of the older program is loaded."""
+    isolation = "process"
+    async with store.run(RAISED, isolation=isolation) as (system, actor, old):
+        actor.tell(old.Wait())
+        async with asyncio.timeout(LONG):
+            while not any(k == 4 for _, k in system._homes.at("/app/a").ledger.waits.dues):
+                await asyncio.sleep(0.01)
+    with pytest.raises(hf.StartFailed, match=said):
+        async with store.run(RAISED.replace(*change), isolation=isolation):
+            pass
+    async with store.run(RAISED, isolation=isolation) as (_, actor, old):
+        actor.tell(old.Tick())
+        assert await actor.ask(old.Get(), timeout=LONG) == ["NoSeat(3)", "Closed('the shop')", "Kept(x=1, y=0)"]
 
 
 async def test_classes_inside_of_a_state(store: Generations) -> None:

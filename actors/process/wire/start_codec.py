@@ -7,6 +7,7 @@ import importlib
 import operator
 import sys
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import Any, ClassVar, TypeVar
 
 from ...errors import SpecError, type_name
@@ -96,6 +97,24 @@ def unpack_data(data: bytes) -> Any:
         SpecError: a class cannot be found. DamagedValue: these are no such bytes.
     """
     return _raise_up(decode_value(data))
+
+
+def pack_argument(value: object, where: str) -> bytes:
+    """An argument of a start that is sent by itself, as bytes: unlike a recipe it may hold refs.
+
+    Raises:
+        UnsavableValue, SpecError: as `pack_recipe`.
+    """
+    return encode_value(_lower(value, where), where=where)
+
+
+def unpack_argument(data: bytes, refs: Callable[[str], object], *, imports: bool) -> Any:
+    """The argument again, with the refs of those who read it. `imports`: only for what the root has sent.
+
+    Raises:
+        SpecError, DamagedValue: as `unpack_data`.
+    """
+    return _raise_up(decode_value(data, imports=imports, refs=refs), imports=imports)
 
 
 def unpack_told(data: bytes, kind: type[T]) -> T:

@@ -232,6 +232,62 @@ def test_children_that_sleep_are_checked_by_their_template_and_those_that_have_e
     assert "/app/rooms has forgotten it" in found["/app/rooms/ann"]["problem"]
 
 
+GIVEN = """
+import asyncio, dataclasses, sys
+
+import holdfast as hf
+
+
+@dataclasses.dataclass
+class Seat:
+    row: int
+
+
+class Leave(hf.Message): ...
+
+
+class Guest(hf.Actor):
+    def __init__(self, seat: object) -> None:
+        self.seat = seat
+
+    @hf.on(Leave)
+    def leave(self, message: Leave) -> None: ...
+
+
+guest = hf.child(None, hf.start(Guest), recovery=hf.hybrid())
+tree = [hf.dynamic("rooms", template=guest, journal=True)]
+
+
+async def main() -> None:
+    async with hf.ActorSystem("app", store=f"sqlite:{sys.argv[1]}", log=False) as system:
+        rooms = await system.start(tree[0])
+        for name, given in (("ann", Seat(3)), ("bob", 4)):
+            one = await rooms.ask(hf.StartChild(args=(given,), id=name))
+            await one.ask(Leave())
+"""
+
+
+def test_a_child_whose_own_arguments_newer_code_cannot_read_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    code, store = tmp_path / "code", tmp_path / "app.db"
+    code.mkdir()
+    (code / "given.py").write_text(GIVEN)
+    run = "import asyncio, given; asyncio.run(given.main())"
+    subprocess.run(
+        [sys.executable, "-c", run, str(store)], check=True, cwd=code, env=environment(tmp_path), timeout=60.0
+    )
+    (code / "given.py").write_text(GIVEN.replace("Seat", "Place"))
+    status, found, _ = check(monkeypatch, store, code, spec="given:tree")
+    assert {address: one["verdict"] for address, one in found.items()} == {
+        "/app/rooms/ann": "refused",
+        "/app/rooms/bob": "fine",
+    }
+    assert "would not be started, since what is noted of it cannot be read" in found["/app/rooms/ann"]["problem"]
+    assert "given:Seat" in found["/app/rooms/ann"]["problem"]
+    assert status == 1
+
+
 def test_a_store_that_cannot_be_read_is_refused_in_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     code = newer(tmp_path)
     (tmp_path / "app.db").write_bytes(b"no store" * 1000)
