@@ -191,7 +191,7 @@ class StartChild(RuntimeOrder[Any]):
             set_field(self, "kwargs", {name: boxed_argument(value) for name, value in self.kwargs.items()})
 
     def arguments(self, node: Node) -> tuple[tuple[Any, ...], dict[str, Any]]:
-        """What is given to the actor besides the template's own. Raises SpecError if it cannot be read here."""
+        """Read what the actor is given behind the template's own arguments. Raises SpecError if that cannot be had."""
         named = {name: opened_argument(value, node) for name, value in self.kwargs.items()}
         return tuple(opened_argument(value, node) for value in self.args), named
 

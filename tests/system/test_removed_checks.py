@@ -1962,7 +1962,7 @@ CHECKS = {
     ),
     "a hook returns an exit reason": Check(
         "actors/kernel/lifecycle.py",
-        'exit_reasons.check_reason("on_stop", result)',
+        "exit_reasons.check_farewell(end.reason, result)",
         "pass",
         WRONG,
         "test_a_hook_that_returns_a_wrong_reason",
