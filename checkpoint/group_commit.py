@@ -33,6 +33,8 @@ RETRY_SECONDS = 0.05
 MOST_RETRY_SECONDS = 1.0
 MOST = 250
 """Messages written and let out in one go, or their ends: about 2 ms of the loop's time."""
+STEPS = 4
+"""Steps of the loop for which what a turn has heard waits for what the turn says next: both are one append then."""
 PATIENCE_SECONDS = 0.05
 """How long the message handler may take to come, before the homes do its work themselves."""
 
@@ -79,7 +81,7 @@ class Commits:
         self._loop, self._emit, self._where = loop, emit, where
         self._lanes = CommitLanes(engine.safe_at == "sync", self.durability == "fsync")
         self._context = contextvars.copy_context()
-        self._is_awake = self._is_running = False
+        self._is_awake = self._is_running = self._is_patient = False
         self._overdue: asyncio.TimerHandle | None = None
         self._thread: ThreadPoolExecutor | None = None
         self._syncing: asyncio.Future[None] | None = None
@@ -130,13 +132,30 @@ class Commits:
         if error is not None:
             raise type(error)(*error.args)
 
-    def submit(self, submission: Submission) -> None:
-        """Take in what has happened: it is written at the end of this tick, or when the store has room again."""
+    def submit(self, submission: Submission, *, is_patient: bool = False) -> None:
+        """Take in what has happened: it is written at the end of this tick, or when the store has room again.
+
+        If it `is_patient`, nothing waits for it itself: it is written with what is submitted next, or `STEPS` later.
+        """
         if self.stopped is not None:  # It never leaves: what is open now is taken up again when the store is.
             submission.abandoned(self.stopped)
             return
         self._lanes.submit(submission)
-        if not self._is_awake:
+        if self._is_awake:
+            return
+        if not is_patient:
+            self._wake()
+        elif not self._is_patient:
+            self._is_patient = True
+            self._wait(STEPS)
+
+    def _wait(self, steps: int) -> None:
+        """Have what is patient written after so many steps, if nobody has had it written before."""
+        if steps and self._lanes.pending and not self._is_awake:
+            self._loop.call_soon(self._wait, steps - 1, context=self._context)
+            return
+        self._is_patient = False
+        if self._lanes.pending and not self._is_awake:
             self._wake()
 
     def _wake(self) -> None:
@@ -443,9 +462,9 @@ class Unkept(MemoryJournal):
         self.commits = commits
         self.epoch = commits.epoch
 
-    def submit(self, submission: Submission) -> None:
+    def submit(self, submission: Submission, *, is_patient: bool = False) -> None:
         """Take in what concerns other homes."""
-        self.commits.submit(submission)
+        self.commits.submit(submission, is_patient=is_patient)
 
     def admit(self, submission: Submission) -> None:
         """Take in what may still be refused."""

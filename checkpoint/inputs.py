@@ -179,10 +179,10 @@ class Batch:
         self.entries.append((path, entry))
         self.sinks.append(sink)
 
-    def commit(self, journal: HomeJournal) -> None:
-        """Have all of it appended; then it takes effect."""
+    def commit(self, journal: HomeJournal, *, is_patient: bool = False) -> None:
+        """Have all of it appended; then it takes effect. `is_patient`: it need not be appended by itself."""
         if self.entries:
-            journal.submit(self)
+            journal.submit(self, is_patient=is_patient)
         elif not self.is_taken:
             self.safe()
 

@@ -448,7 +448,11 @@ class PendingCalls:
             batch.commit(home.journal)
 
     def outcome(self, turn: int, k: int, answer: Answer, batch: Batch | None) -> None:
-        """An output of ours has an outcome: journal it, then tell the turn that waits."""
+        """An output of ours has an outcome: journal it, and tell the turn that waits.
+
+        The turn goes on before that is safe: what it lets out is journaled behind it, and leaves when both are. If a
+        `batch` holds more than the outcome, the turn is told when that is safe.
+        """
         own = batch if batch is not None else Batch()
         ask = self.asks.pop((turn, k), None)
         self.effects.pop((turn, k), None)
@@ -461,11 +465,13 @@ class PendingCalls:
         if ask is not None and ask.hears is not None:
             ask.hears(ask.failure(answer))
         told = came(answer) if kept is None else kept
-        own.after.append(lambda: self._tell(turn, k, told))
+        if batch is not None:
+            own.after.append(lambda: self._tell(turn, k, told))
         if ask is not None and ask.settled is not None:
             own.after.append(ask.settled)
         if batch is None:
-            own.commit(self._home.journal)
+            own.commit(self._home.journal, is_patient=True)
+            self._tell(turn, k, told)
 
     def abandon(self) -> None:
         """What is still out concerns nobody any more."""

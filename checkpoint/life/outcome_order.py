@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Final
 
+from ...actors.kernel.cell import RUNNING
 from ...actors.kernel.loop import TurnRemains
 from ..protocol import GIVEN_UP, MESSAGE, GivenUp, Outcome, untimed
 from .recorded_context import Resting
@@ -155,7 +156,9 @@ class OutcomeOrder:
 
 
 def is_killed(cell: Cell) -> bool:
-    """Whether the turn in hand is killed: it is being cancelled, or has just ended so."""
+    """Whether the turn in hand is killed: it is being cancelled, or has ended so, and its life ends."""
+    if cell.state is not RUNNING:
+        return True  # A turn that ends by itself has done so before its life winds down.
     more, queue = cell.more, cell.queue
     turn = None if more is None else more.turn
     if turn is None and queue and isinstance(queue[0], TurnRemains):

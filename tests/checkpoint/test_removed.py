@@ -597,6 +597,20 @@ CHECKS = {
         RACE_PROGRAMS,
         "test_every_life_goes_the_same_way and task",
     ),
+    "nor has one whose life winds down": Check(
+        "checkpoint/life/outcome_order.py",
+        "    if cell.state is not RUNNING:\n",
+        "    if False:\n",
+        "tests/effects/test_changes_of_races.py",
+        "test_so_it_is_in_any_order_of_steps and task",
+    ),
+    "what a turn has heard is written with what it says next": Check(
+        "checkpoint/group_commit.py",
+        "        if not is_patient:\n",
+        "        if True:\n",
+        "tests/checkpoint/test_gathering.py",
+        "test_what_a_turn_has_heard",
+    ),
     "nor has one that was killed and has just ended": Check(
         "checkpoint/life/outcome_order.py",
         "    if turn is None and queue and isinstance(queue[0], TurnRemains):\n",
