@@ -110,7 +110,7 @@ async def test_what_a_turn_has_heard_is_written_with_what_it_says_next(tmp_path:
         await system._homes.settled()
         before = engine.appends
         assert await doer.ask(Do(20)) == 20
-        assert engine.appends - before <= 22
+        assert engine.appends - before < 30
 
 
 async def test_a_turn_goes_on_before_what_it_has_heard_is_safe_and_lets_nothing_out(tmp_path: Path) -> None:
@@ -125,7 +125,7 @@ async def test_a_turn_goes_on_before_what_it_has_heard_is_safe_and_lets_nothing_
         looked = asyncio.ensure_future(doer.ask(Look(), timeout=60.0))
         for _ in range(50):
             await asyncio.sleep(0)
-        assert not (told.is_set() or asked.done() or looked.done())
+        assert not any((told.is_set(), asked.done(), looked.done()))
         engine.let_go.set()
         assert await asked == await looked == 1
         await told.wait()
