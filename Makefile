@@ -58,7 +58,7 @@ campaign: $(VENV)/.dev
 	HOLDFAST_REPAIRS=25 HOLDFAST_REMOVED=1 $(BIN)/python -m pytest -q -s -p no:xdist -o faulthandler_timeout=0 \
 	    tests/diagnosis/repair/test_no_worse.py tests/diagnosis/repair/test_removed_repair.py \
 	    tests/diagnosis/live/test_replicas.py
-	HOLDFAST_FOREIGN=20 $(BIN)/python -m pytest -q -n 2 -s -o faulthandler_timeout=0 tests/diagnosis/foreign
+	HOLDFAST_FOREIGN=20 HOLDFAST_CROSSED=1 $(BIN)/python -m pytest -q -n 2 -s -o faulthandler_timeout=0 tests/diagnosis/foreign
 	$(BIN)/python -m tests.diagnosis.foreign.days 24
 	$(BIN)/python -m tests.diagnosis.foreign.repairs 3
 	HOLDFAST_BUILDS=1 $(BIN)/python -m pytest -q -s tests/packaging

@@ -8,7 +8,8 @@ waits, with `loop_factories=["virtual"]` (`holdfast.testing.clock`). The loops a
 (`holdfast_loops`) and made by our own plugin.
 
 Of a test that is marked with `pairs` some rows run, in which each pair of values of two parameters occurs; the loop
-is one of these parameters where a test runs under both. `HOLDFAST_CROSSED=1` runs all.
+is one of these parameters where a test runs under both. Of one marked with `some(n)`, whose rows take long, n run,
+spread evenly, or all where checks are removed. `HOLDFAST_CROSSED=1` runs all.
 
 What Hypothesis draws depends on the test alone, so a run today finds what it found yesterday, on every machine;
 `HOLDFAST_RANDOM=1` draws anew, and `HOLDFAST_RANDOM=N` repeats the run that printed this number.
@@ -42,7 +43,7 @@ from holdfast.testing.guard import process_leaks
 from holdfast.testing.guard.leaks import Leaks
 from holdfast.testing.guard.loop_leaks import LoopLeaks
 from holdfast.testing.guard.process_leaks import GRACE, end_processes, is_of_test
-from tests.pairs import covering
+from tests.pairs import covering, spread
 from tests.supervision.programs import Ends
 from tests.waits import Waits
 from tests.warm import WarmServers, warm_popen
@@ -121,6 +122,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
         config.stash[LISTENER] = Listener()
     config.addinivalue_line("markers", "pairs: each pair of values of two parameters is enough (tests/pairs.py)")
+    config.addinivalue_line("markers", "some(n): so many of its rows are enough, spread evenly (tests/pairs.py)")
     if RANDOM == "1":
         os.environ["HOLDFAST_RANDOM"] = str(random.SystemRandom().randrange(2, 2**32))
     if config.pluginmanager.hasplugin("xdist"):
@@ -160,7 +162,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """Leave each test the parameters and the loops that it shall run under."""
     dropped: set[pytest.Item] = set()
     if "HOLDFAST_CROSSED" not in os.environ:
-        dropped |= _beyond_pairs(items)
+        dropped |= _beyond_rows(items)
     if os.environ.get("HOLDFAST_LOOPS") != "both":
         dropped |= _of_other_loops([item for item in items if item not in dropped])
     if dropped:
@@ -180,13 +182,15 @@ def _longest_first(items: list[pytest.Item]) -> None:
     items[:] = [item for name in order for item in files[name]]
 
 
-def _beyond_pairs(items: list[pytest.Item]) -> set[pytest.Item]:
-    """Rows of tests marked with `pairs` all of whose pairs other rows have (`tests/pairs.py`)."""
+def _beyond_rows(items: list[pytest.Item]) -> set[pytest.Item]:
+    """Rows of tests marked with `pairs` all of whose pairs other rows have (`tests/pairs.py`), or beyond `some`."""
     places = Places()
     rows: dict[str, dict[tuple[int, ...], list[pytest.Item]]] = {}
+    counts: dict[str, int] = {}
     for item in items:
         callspec = getattr(item, "callspec", None)
-        if callspec is not None and item.get_closest_marker("pairs"):
+        some = None if "HOLDFAST_REMOVED" in os.environ else item.get_closest_marker("some")
+        if callspec is not None and (some or item.get_closest_marker("pairs")):
             params = dict(callspec.params)
             test = item.nodeid.partition("[")[0]
             if not _chooses_loops(item):
@@ -195,9 +199,11 @@ def _beyond_pairs(items: list[pytest.Item]) -> set[pytest.Item]:
                 places.of(test, name, value) for name, value in sorted(params.items(), key=lambda pair: pair[0])
             )
             rows.setdefault(test, {}).setdefault(row, []).append(item)
+            if some:
+                counts[test] = some.args[0]
     dropped: set[pytest.Item] = set()
-    for of_test in rows.values():
-        kept = set(covering(list(of_test)))
+    for test, of_test in rows.items():
+        kept = set(spread(len(of_test), counts[test]) if test in counts else covering(list(of_test)))
         dropped.update(item for number, some in enumerate(of_test.values()) if number not in kept for item in some)
     return dropped
 

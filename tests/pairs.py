@@ -2,7 +2,8 @@
 
 What shows only in a process, or only in a process with one of the methods, a row for each pair shows; the product of
 three or four parameters shows it many times over. The marker `pairs`, of a test or of a file, says that pairs do.
-`HOLDFAST_CROSSED=1` runs the product.
+Of one parameter with many values whose tests take long, `some(n)` has so many run. `HOLDFAST_CROSSED=1` runs the
+product, and all values.
 
 Source: pairwise testing (Cohen et al., "The AETG System", IEEE TSE 1997).
 """
@@ -30,3 +31,12 @@ def covering(rows: Sequence[tuple[int, ...]]) -> list[int]:
         left -= pairs[best]
         taken.append(best)
     return sorted(taken)
+
+
+def spread(count: int, some: int) -> list[int]:
+    """The numbers of `some` of so many rows, spread evenly, with the first one.
+
+    >>> spread(10, 4), spread(3, 5)
+    ([0, 2, 5, 7], [0, 1, 2])
+    """
+    return [number * count // some for number in range(some)] if some < count else [*range(count)]

@@ -7,7 +7,7 @@ import itertools
 
 import pytest
 
-from tests.pairs import covering
+from tests.pairs import covering, spread
 
 
 @pytest.mark.parametrize("sizes", [(1,), (5,), (3, 2), (3, 3, 2), (2, 2, 2), (3, 3, 2, 2), (4, 3, 2, 2, 2)])
@@ -24,6 +24,17 @@ def test_pairs_that_do_not_occur_are_not_missed() -> None:
     rows = [(0, 0, 0), (0, 1, 1), (1, 0, 1)]
     assert covering(rows) == [0, 1, 2]
     assert covering([()]) == [0]
+
+
+@pytest.mark.parametrize("count", range(1, 12))
+@pytest.mark.parametrize("some", range(1, 12))
+def test_some_rows_are_spread_evenly(count: int, some: int) -> None:
+    kept = spread(count, some)
+    assert len(set(kept)) == len(kept) == min(count, some)
+    assert kept[0] == 0
+    assert kept[-1] < count
+    gaps = [after - before for before, after in zip(kept, [*kept[1:], count], strict=True)]
+    assert max(gaps) - min(gaps) <= 1
 
 
 @pytest.mark.asyncio(loop_factories=["asyncio", "virtual"])

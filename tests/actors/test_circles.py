@@ -145,6 +145,7 @@ WAYS = [not_at_all, one_of_two, within, wait_for, in_a_scope, behind_a_scope, sh
 
 @pytest.mark.parametrize("first", [True, False], ids=["first", "second"])
 @pytest.mark.parametrize("way", WAYS)
+@pytest.mark.some(14)
 async def test_nobody_is_refused_who_may_get_on(system: hf.ActorSystem, way: Any, first: bool) -> None:
     """Its turn need not wait for the reply to its end, so the other one gets its own."""
     free, peer = hf.start(Free, way), hf.start(Peer)

@@ -54,6 +54,7 @@ def running(store: str | None) -> hf.ActorSystem:
 
 @pytest.mark.pairs
 @pytest.mark.parametrize("room", [0, FORKED])
+@pytest.mark.some(3)
 async def test_what_little_has_changed_is_written_and_all_comes_back(
     store: str | None, isolation: str, room: int
 ) -> None:

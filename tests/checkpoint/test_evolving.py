@@ -85,6 +85,7 @@ CASES = {
 
 @pytest.mark.parametrize("what", ["killed", "saved", "stopped"])
 @pytest.mark.parametrize("name", CASES)
+@pytest.mark.some(14)
 def test_code_goes_on_with_what_it_can_read(tmp_path: Path, name: str, what: str) -> None:
     case = CASES[name]
     assert run(tmp_path, CODE, what).returncode == (0 if what == "stopped" else -9)
@@ -207,6 +208,7 @@ OUTCOMES = {
 
 @pytest.mark.parametrize("what", ["killed", "saved", "stopped"])
 @pytest.mark.parametrize("change", OUTCOMES)
+@pytest.mark.some(8)
 def test_replies_and_refusals_in_the_journal_are_not_misread(tmp_path: Path, change: str, what: str) -> None:
     assert run(tmp_path, ASKING, what).returncode == (0 if what == "stopped" else -9)
     old, new, problem = OUTCOMES[change]

@@ -108,6 +108,7 @@ ROWS = [
 
 
 @pytest.mark.parametrize(("name", "where", "way", "is_struck"), ROWS)
+@pytest.mark.some(30)
 async def test_who_has_given_up_before_the_turn_begins_is_not_served(
     system: hf.ActorSystem, name: str, where: str, way: Way, is_struck: bool
 ) -> None:

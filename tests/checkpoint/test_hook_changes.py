@@ -198,6 +198,7 @@ async def test_who_falls_again_and_again_between_two_turns_is_given_up(place: st
 
 @pytest.mark.parametrize("place", list(PLACES))
 @pytest.mark.parametrize("is_saved", [True, False], ids=["from a snapshot", "by a replay"])
+@pytest.mark.some(6)
 async def test_who_dies_again_comes_back_with_what_stands_on_the_change(
     system: hf.ActorSystem, is_saved: bool, place: str
 ) -> None:

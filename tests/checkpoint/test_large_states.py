@@ -207,6 +207,7 @@ def test_a_root_that_is_killed_while_a_state_comes_back_loses_nothing(tmp_path: 
 
 
 @pytest.mark.parametrize("cells", [CELLS, MANY])
+@pytest.mark.some(3)
 async def test_what_was_saved_as_one_value_at_a_stop_comes_back(tmp_path: Path, isolation: str, cells: int) -> None:
     want, store = model(cells), f"sqlite:{tmp_path / 'app.db'}"
     for number in range(3):
@@ -373,6 +374,7 @@ def newest_pack(store: Path) -> Path:
 
 @pytest.mark.parametrize("where", REMOTE)
 @pytest.mark.parametrize("damage", ["byte", "cut", "missing"])
+@pytest.mark.some(3)
 async def test_a_snapshot_that_is_damaged_meanwhile_is_passed_over(tmp_path: Path, where: str, damage: str) -> None:
     store, want = tmp_path / "app.db", model(MANY)
     async with hf.ActorSystem("app", store=f"sqlite:{store}", log=False, intensity=1000) as system:

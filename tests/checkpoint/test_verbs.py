@@ -239,6 +239,7 @@ async def test_what_only_a_later_life_does_is_in_force_once_after_each_crash(
 @pytest.mark.parametrize("end", ["stopped", "killed"])
 @pytest.mark.parametrize("moments", [[FIRST, RESTORED], [TURN]], ids=", ".join)
 @pytest.mark.parametrize("name", ["hybrid", "replay_only", "checkpoint_only"])
+@pytest.mark.some(6)
 async def test_it_goes_on_over_a_restart_of_the_root(
     name: str, moments: list[str], end: str, isolation: str, tmp_path: Path
 ) -> None:

@@ -19,7 +19,7 @@ from holdfast.checkpoint.home import ask_recovery
 from holdfast.testing.fleet.sim_fleet import SimFleet, SimProgram
 from tests.cluster.fleets import simulate
 
-SEEDS = int(os.environ.get("HOLDFAST_ORDERLY_STOPS", "6"))
+SEEDS = int(os.environ.get("HOLDFAST_ORDERLY_STOPS", "3"))
 AWAY = 20.0
 """Seconds in which the servers of a system take nothing: longer than a takeover."""
 

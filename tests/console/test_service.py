@@ -219,6 +219,7 @@ async def test_sighup_has_another_tree_planted(project: Path) -> None:
         ("tree.py", TREE.replace("    return [", "    raise SystemExit(3)\n    return ["), "SystemExit"),
     ],
 )
+@pytest.mark.some(4)
 async def test_a_reload_that_fails_changes_nothing(project: Path, file: str, text: str, problem: str) -> None:
     async with running("tree:tree") as service:
         before, good = await service.state(), (project / file).read_text()

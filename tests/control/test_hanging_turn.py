@@ -96,6 +96,7 @@ async def hanging(place: str) -> AsyncGenerator[tuple[hf.ActorSystem, hf.ActorRe
 
 @pytest.mark.parametrize("call", CALLS)
 @pytest.mark.parametrize("place", PLACES)
+@pytest.mark.some(14)
 async def test_whoever_waits_in_vain_is_told_which_turn_is_in_the_way(place: str, call: str) -> None:
     if (place, call) == ("task", "checkpoint"):
         pytest.skip("it keeps no snapshots")

@@ -45,6 +45,7 @@ class Till(hf.Actor):
 
 @pytest.mark.parametrize("place", PLACES)
 @pytest.mark.parametrize("how", ["sleep", "effect"])
+@pytest.mark.some(5)
 async def test_a_turn_that_waits_for_too_long_is_told_of(place: str, how: str) -> None:
     async with hf.ActorSystem("app", log=False, watch_waits=LIMIT) as system:
         till = await system.start(hf.child("till", hf.start(Till), **PLACES[place]))

@@ -60,6 +60,7 @@ each_program = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 
 @each_program
 @pytest.mark.asyncio(loop_factories=["uvloop"])
+@pytest.mark.some(3)
 async def test_killed_twice_it_ends_as_if_it_had_not_been(case: Case) -> None:
     undisturbed = await run(case.load_or_skip())
     assert undisturbed.verdict.correct, undisturbed.verdict.figures

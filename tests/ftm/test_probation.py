@@ -271,6 +271,7 @@ async def test_how_a_change_went_is_told_however_late_one_asks(
     [(PBR(), "leader"), (LFR(), "leader"), (LFR(), "other"), (TMR(), "leader"), (TR(), "leader")],
     ids=str,
 )
+@pytest.mark.some(5)
 async def test_a_brick_that_does_not_return_is_told_in_whatever_role(
     system: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch, below: Mechanism, whose: str, part: str
 ) -> None:

@@ -199,6 +199,7 @@ async def test_what_is_put_back_is_handled_as_without_a_mechanism(
 
 @pytest.mark.parametrize("seed", [0, 1, 2, 3, "101", "103", "110"])
 @pytest.mark.parametrize("mechanism", ["pbr", "lfr", "tmr", "tr+pbr"])
+@pytest.mark.some(12)
 async def test_whoever_leads_dies_while_what_was_put_back_is_handled(
     system: hf.ActorSystem, mechanism: str, seed: int | str
 ) -> None:

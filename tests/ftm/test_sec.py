@@ -159,6 +159,7 @@ REFUSALS: dict[str, tuple[Callable[[bytes], bytes | None], str]] = {
 
 @pytest.mark.parametrize("harm", REFUSALS)
 @pytest.mark.parametrize("name", ["SEC over PBR", "SEC over LFR"])
+@pytest.mark.some(3)
 async def test_what_is_altered_or_dropped_on_the_way_is_said_again(
     secured: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch, name: str, harm: str
 ) -> None:

@@ -83,6 +83,7 @@ async def told(events: hf.events.EventStream) -> None:
         ),
     ],
 )
+@pytest.mark.some(5)
 async def test_a_state_that_a_hook_leaves_and_nobody_can_save(
     tmp_path: Path, name: str, how: str, kind: type[Locking]
 ) -> None:

@@ -386,6 +386,7 @@ async def test_a_turn_that_waits_wherever_both_live(
 )
 @pytest.mark.parametrize("place", ["task", "process"])
 @pytest.mark.parametrize("recovery", [None, hf.hybrid()], ids=["none", "hybrid"])
+@pytest.mark.some(4)
 async def test_a_turn_that_rests_as_it_has_said(
     system: hf.ActorSystem, place: Any, recovery: hf.Method | None, what: str, says: str
 ) -> None:

@@ -46,6 +46,7 @@ async def system() -> Any:
 
 @pytest.mark.pairs
 @pytest.mark.parametrize(("place", "kind", "step"), cells())
+@pytest.mark.some(16)
 async def test_an_actor_is_taken_there_with_all_it_has(
     system: hf.ActorSystem, place: str, kind: str, step: str
 ) -> None:

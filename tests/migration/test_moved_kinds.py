@@ -127,6 +127,7 @@ COUNTS = {"own": 2, "pool": 2, "partitions": 3, "template": 2, "journal": 1, "st
 @pytest.mark.parametrize("way", SOME_WAYS)
 @pytest.mark.parametrize("kind", list(COUNTS))
 @pytest.mark.parametrize("when", WHENS)
+@pytest.mark.some(12)
 async def test_a_root_that_is_killed_has_all_of_it_at_one_of_the_two(
     tmp_path: Path, when: str, kind: str, way: str
 ) -> None:

@@ -82,6 +82,7 @@ async def system() -> Any:
 @pytest.mark.parametrize("way", list(WAYS))
 @pytest.mark.parametrize("kind", list(KINDS))
 @pytest.mark.parametrize("place", PLACES)
+@pytest.mark.some(9)
 async def test_all_below_it_go_with_all_they_have(system: hf.ActorSystem, place: str, kind: str, way: str) -> None:
     old, new = WAYS[way]
     await plant(system, old, spec_for(way, kind, place), old, new)
@@ -112,6 +113,7 @@ async def test_all_below_it_go_with_all_they_have(system: hf.ActorSystem, place:
 @pytest.mark.parametrize("place", PLACES)
 @pytest.mark.parametrize("victim", ["old", "new", "own", "team"])
 @pytest.mark.parametrize("seed", range(6))
+@pytest.mark.some(17)
 async def test_who_is_killed_at_any_instant_loses_nothing(
     system: hf.ActorSystem, seed: int, victim: str, place: str, way: str
 ) -> None:
@@ -168,6 +170,7 @@ async def killed(store: str, when: str, way: str, place: str) -> None:
 @pytest.mark.parametrize("way", list(WAYS))
 @pytest.mark.parametrize("place", PLACES)
 @pytest.mark.parametrize("when", WHENS)
+@pytest.mark.some(12)
 async def test_a_root_that_is_killed_has_all_of_it_at_one_of_the_two(
     tmp_path: Path, when: str, place: str, way: str
 ) -> None:
@@ -187,6 +190,7 @@ async def test_a_root_that_is_killed_has_all_of_it_at_one_of_the_two(
 
 @pytest.mark.parametrize("way", list(WAYS))
 @pytest.mark.parametrize("place", PLACES)
+@pytest.mark.some(9)
 async def test_a_move_that_is_given_up_leaves_all_where_it_was(system: hf.ActorSystem, place: str, way: str) -> None:
     old, new = WAYS[way]
     await plant(system, old, spec_for(way, "plain", place), old, new)
@@ -296,6 +300,7 @@ async def hears(friend: hf.ActorRef[Friend], what: list[str]) -> None:
 @pytest.mark.pairs
 @pytest.mark.parametrize("way", list(WAYS))
 @pytest.mark.parametrize("at", ["root", "process", "old", "new"])
+@pytest.mark.some(12)
 async def test_who_is_tied_to_it_is_tied_to_the_one_that_takes_its_place(
     system: hf.ActorSystem, at: str, way: str
 ) -> None:

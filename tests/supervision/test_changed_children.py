@@ -59,6 +59,7 @@ def killed(store: str, kind: str, direction: str, place: Isolation = "task") -> 
 @pytest.mark.parametrize("how", ["child", "supervisor", "program", "killed"])
 @pytest.mark.parametrize("direction", ["there", "back"])
 @pytest.mark.parametrize("kind", player.KINDS)
+@pytest.mark.some(12)
 async def test_what_is_changed_of_a_child_is_kept(tmp_path: Path, kind: str, direction: str, how: str) -> None:
     store, before = f"sqlite:{tmp_path / 'app.db'}", None
     if how == "killed":
@@ -91,6 +92,7 @@ async def classes(system: hf.ActorSystem) -> dict[str, list[Any]]:
 @pytest.mark.parametrize("how", ["child", "supervisor", "program", "killed"])
 @pytest.mark.parametrize("renewal", player.RENEWALS)
 @pytest.mark.parametrize("place", ["task", "process"])
+@pytest.mark.some(15)
 async def test_a_new_template_and_new_code_reach_all_and_are_kept(
     tmp_path: Path, place: Isolation, renewal: str, how: str
 ) -> None:

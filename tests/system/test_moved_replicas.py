@@ -288,6 +288,7 @@ def changes(at: list[str]) -> list[str]:
 @STACK
 @KIND
 @THERE_IN
+@pytest.mark.some(8)
 async def test_it_lives_on_in_its_replicas_at_another_address(there: str, stack: str, kind: str) -> None:
     async with program(stack, kind, there=there) as system:
         one = resident(system)
@@ -558,6 +559,7 @@ class Refuse(hf.system.Operation):
 
 @STACK
 @KIND
+@pytest.mark.some(8)
 async def test_a_move_that_is_given_up_leaves_it_as_it_was(stack: str, kind: str) -> None:
     async with program(stack, kind) as system:
         one = resident(system)
@@ -710,6 +712,7 @@ async def test_what_a_replica_says_before_it_has_heard_of_its_address_is_meant_s
 @pytest.mark.parametrize("whom", ["leader", "follower", "all"])
 @pytest.mark.parametrize("when", ["prepare", "commit", "finish"])
 @THERE_IN
+@pytest.mark.some(36)
 async def test_replicas_that_are_killed_at_a_step_of_the_move(there: str, when: str, whom: str, kind: str) -> None:
     """When it is at rest; in the step of the loop in which its address changes; behind that."""
     async with program("LFR" if when == "commit" else "PBR", kind, there=there) as system:

@@ -133,6 +133,7 @@ def test_the_rows_have_every_pair() -> None:
     assert {pair for row in named for pair in itertools.combinations(row, 2)} == pairs
 
 
+@pytest.mark.some(11)
 @pytest.mark.parametrize("row", ROWS)
 def test_the_fixtures_work_beside_other_plugins(
     pytester: pytest.Pytester, row: str, monkeypatch: pytest.MonkeyPatch

@@ -138,6 +138,7 @@ def changed(text: str, change: dict[str, str]) -> str:
 
 @pytest.mark.parametrize("isolation", ["task", "process"])
 @pytest.mark.parametrize("row", ROWS)
+@pytest.mark.some(14)
 async def test_messages(tmp_path: Path, row: str, isolation: Any) -> None:
     """One was handled, one was put aside, one waits, and one comes by a timer: all of them alike."""
     store, case = Generations(tmp_path), ROWS[row]

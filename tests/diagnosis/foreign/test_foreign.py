@@ -41,6 +41,7 @@ TRIALS = int(os.environ.get("HOLDFAST_FOREIGN", "0"))
 @pytest.mark.parametrize("seed", [1])
 @pytest.mark.parametrize("kind", TRAFFICS)
 @pytest.mark.parametrize("foreign", SYSTEMS, ids=lambda foreign: foreign.name)
+@pytest.mark.some(6)
 async def test_traffic_is_no_fault(foreign: Foreign, kind: str, seed: int) -> None:
     assert (await trial(foreign, {}, kind, seed, 20.0)).false_alarms == ()  # Days of it: `days.py`.
 

@@ -149,6 +149,7 @@ async def test_who_hears_nothing_is_not_given_the_time_to_end(recovery: Any) -> 
 
 @pytest.mark.parametrize("isolation", ["task", "process"])
 @pytest.mark.parametrize(("how", "recovery"), RESTS)
+@pytest.mark.some(3)
 async def test_a_turn_that_rests_as_it_has_said_does_not_hang(how: str, recovery: Any, isolation: Any) -> None:
     spec = hf.child("node", hf.start(Node), isolation=isolation, recovery=recovery, shutdown="brutal_kill")
     async with hf.ActorSystem("t", log=False) as system:

@@ -20,7 +20,7 @@ from tests.diagnosis.repair.simulated import Scene, World, now, scene
 
 pytestmark = pytest.mark.asyncio(loop_factories=["virtual"])
 
-RUNS = int(os.environ.get("HOLDFAST_RUNS", "30"))
+RUNS = int(os.environ.get("HOLDFAST_RUNS", "15"))
 IS_LONG = "HOLDFAST_RUNS" in os.environ
 VISIBLE = ("hm", "hn", "in", "jn", "jtn")
 """Nodes whose silence is seen."""

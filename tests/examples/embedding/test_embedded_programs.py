@@ -58,6 +58,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("name", CASES)
+@pytest.mark.some(3)
 def test_nothing_confirmed_is_lost_by_sigterm_or_by_kill_9(name: str, tmp_path: Path) -> None:
     case = CASES[name]
     with running(case, tmp_path) as program, Load(program) as load:

@@ -90,6 +90,7 @@ CHANGES = {
 
 
 @pytest.mark.parametrize("name", CHANGES)
+@pytest.mark.some(10)
 def test_a_change_is_told_with_its_turn_and_the_others_are_checked(
     name: str, store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

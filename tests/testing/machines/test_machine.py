@@ -235,6 +235,7 @@ def test_nothing_is_found_in_what_is_right(machine: type[ActorMachine]) -> None:
 
 
 @pytest.mark.parametrize(("machine", "errors"), WRONG)
+@pytest.mark.some(2)
 def test_a_planted_bug_is_found_and_its_example_can_be_repeated(
     machine: type[ActorMachine], errors: tuple[type[BaseException], ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -24,6 +24,7 @@ def test_the_engine_they_are_made_of_keeps_every_promise(tmp_path: Path) -> None
     assert first_broken_promise(lambda folder: OneFile(folder / "my.store"), tmp_path) == ""
 
 
+@pytest.mark.some(15)
 @pytest.mark.parametrize("engine", JUDGED, ids=lambda engine: engine.__name__)
 def test_a_broken_engine_is_found(engine: type[OneFile], tmp_path: Path) -> None:
     found = first_broken_promise(lambda folder: engine(folder / "my.store"), tmp_path)
