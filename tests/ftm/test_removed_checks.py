@@ -34,13 +34,6 @@ CHECKS = {
         "tests/ftm/test_hooks.py",
         "later_life and pbr and fresh",
     ),
-    "and from the one that it has moved to": Check(
-        "ftm/replica/protected_actor.py",
-        "            life.readdress()\n",
-        "            pass\n",
-        "tests/ftm/test_hooks.py",
-        "later_life and pbr and hybrid",
-    ),
     "what a leader lets out is looked at as what any process lets out": Check(
         "ftm/group/proxy.py",
         "        if not self._may_leave(message):\n",
