@@ -64,6 +64,11 @@ class Home:
     takes_parcels: bool
     """Whether messages that came encoded are passed on as they are."""
 
+    @property
+    def keeps_turns(self) -> bool:
+        """Whether the next life knows all that the last one has handled, and goes on with the turn in hand."""
+        return False
+
     def push(self, cell: Cell, item: Item) -> None:
         """Put an item of the runtime's own in its place behind the messages."""
         raise NotImplementedError

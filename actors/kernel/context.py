@@ -82,7 +82,7 @@ class Borrowed(list["Ask"]):
 class ActorContext:
     """An actor's view of the runtime. It belongs to one life: after that life's end it refuses to send."""
 
-    __slots__ = ("_asked", "_asking", "_cell", "_closed", "_owes", "_random", "_token", "_turn")
+    __slots__ = ("_asked", "_asking", "_cell", "_closed", "_owes", "_random", "_speaker", "_token", "_turn")
 
     _may_fail_fast: ClassVar[bool] = True
     """Whether an ask may end by what the receiver happens to be doing; a replay could not repeat that."""
@@ -94,6 +94,7 @@ class ActorContext:
 
     def __init__(self, cell: Cell) -> None:
         self._cell = cell
+        self._speaker = cell  # who the receivers of what it sends see
         self._closed = False
         self._asked: Cell | None = None  # whom it has asked last
         self._asking: Any = None
@@ -159,7 +160,7 @@ class ActorContext:
         self._alive()
         if type(message) not in cell.table:
             cell.require(message)
-        cell.take_in(cell, Envelope(message, self._cell))
+        cell.take_in(cell, Envelope(message, self._speaker))
 
     async def _send(self, cell: Cell, message: Message[Any]) -> None:
         """Send and wait until it is accepted. Nobody waits for room at itself: that raises MailboxFull, as a tell."""
@@ -170,7 +171,7 @@ class ActorContext:
         if type(message) not in cell.table:
             cell.require(message)
         try:
-            accepted = cell.offer(Envelope(message, self._cell))
+            accepted = cell.offer(Envelope(message, self._speaker))
         except HoldfastError:
             await asyncio.sleep(0)  # Who sends again and again leaves the loop to those for whom it waits.
             raise
@@ -191,7 +192,7 @@ class ActorContext:
         if waits_for(self, cell, chain):
             future.set_exception(AskDeadlock(cell.path, waiters(chain)))
             return in_next_pass(future)
-        ask = Ask(message, self._cell, chain, timeout, NO_DEADLINE, future, cell)
+        ask = Ask(message, self._speaker, chain, timeout, NO_DEADLINE, future, cell)
         node.deadlines.add(ask)
         try:
             cell.take_in(cell, ask)
@@ -301,7 +302,7 @@ class ActorContext:
         if uplink is not None:  # The subscribers are known to the root only.
             self._alive()
             require_message(topic, message)
-            await uplink.publish(topic, self._cell.outgoing(Envelope(message, self._cell)))
+            await uplink.publish(topic, self._cell.outgoing(Envelope(message, self._speaker)))
             return
 
         async def send(cell: Cell) -> None:

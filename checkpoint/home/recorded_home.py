@@ -27,11 +27,6 @@ class RecordedHome(WorkerHome):
         """
         raise NotImplementedError
 
-    @property
-    def keeps_turns(self) -> bool:
-        """Whether the next life knows all that the last one has handled."""
-        raise NotImplementedError
-
 
 def said_of_turn(cell: Cell) -> str:
     """What the turn in hand of a recorded actor waits for, as words behind its address; "" if that is not known."""

@@ -62,12 +62,16 @@ class RootHome(Home):
 
     takes_parcels = True
 
-    def __init__(self, guest: Guest) -> None:
-        self.guest = guest
+    def __init__(self, guest: Guest, *, keeps_turns: bool) -> None:
+        self.guest, self._keeps_turns = guest, keeps_turns
         self.bound: Bounded | None = None
         self.life: Life | None = None  # that is lived here
         self.ends: ExitReason | None = None  # why that is to end, as the home says
         self._homeward: Homeward | None = None
+
+    @property
+    def keeps_turns(self) -> bool:
+        return self._keeps_turns
 
     def enter(self, cell: Cell) -> None:
         """From here on what is sent goes to the root, which counts it."""

@@ -356,4 +356,4 @@ class ChildHere(ChildPlace):
 
 def child_here(guest: Guest, method: Method) -> ChildHere:
     """The place of a recorded child of a supervisor in this process, whose lives are lived here."""
-    return ChildHere(RootHome(guest), method, guest.recovery.port_of)
+    return ChildHere(RootHome(guest, keeps_turns=method.replays), method, guest.recovery.port_of)

@@ -106,7 +106,7 @@ def child_at_root(guest: Guest, spec: ChildSpec) -> ChildAtRoot:
     """The place of a child of a supervisor in this process that is lived elsewhere."""
     recovery = spec.recovery
     method = recovery if recovery is not None and recovery.records else UNKEPT
-    return ChildAtRoot(RootHome(guest), method, guest.recovery.port_of)
+    return ChildAtRoot(RootHome(guest, keeps_turns=method.replays), method, guest.recovery.port_of)
 
 
 def respec(cell: Cell, said: Respec) -> None:

@@ -575,6 +575,8 @@ class Server(lifecycle.HerePlace):
         if self.standing.link is not None:
             self.standing.link.readdress(self.standing.address)
         life = self.life
+        if life is not None:
+            life.readdress()
         if life is None or life.feed is not None or not self.points.tail:
             return
         try:

@@ -87,6 +87,11 @@ class ServerContext(RecordedContext):
     def __init__(self, cell: Cell, server: Server) -> None:
         super().__init__(cell)
         self._server = server
+        self.readdress()
+
+    def readdress(self) -> None:
+        """Have the receivers of what its hooks send at once see the address that is protected now."""
+        self._speaker = self._cell.node.cell_at(self.path)
 
     @property
     def path(self) -> str:
@@ -132,6 +137,10 @@ class ServerLife(Life):
         made = self._context_made = ServerContext(cell, self.server)
         made.recorded = self
         return made
+
+    def readdress(self) -> None:
+        """The actor is protected under another address."""
+        self._context_made.readdress()
 
     def only_rests(self, stranded: Collection[int]) -> bool:
         """Whether the turn in hand waits for moments, messages or these asks, and nothing else of this life is out."""

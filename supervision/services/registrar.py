@@ -12,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections import deque
+from collections.abc import Callable
 from typing import Any, Literal
 
 import msgspec
@@ -440,10 +441,16 @@ class RegistryActor(Actor):
     # -- ends -------------------------------------------------------------------------------------------------------
 
     def on_down(self, source: ActorRef[Any], reason: ExitReason, recovering: bool) -> None:
-        """Let go what a holder held whose life is over, unless it is brought back with its state."""
+        """Let go what a holder held whose life is over, unless it is brought back with its state.
+
+        A lock belongs to a turn: if the next life does not go on with that, nobody would give it back.
+        """
+        holder: Cell = source._cell
         if not recovering:
-            self._drop_dead(source._cell, told=True)
+            self._drop_dead(holder, told=True)
             self._take_back(source.path)
+        elif not isinstance(holder.host, OutsideHost) and not holder.host.home.keeps_turns:
+            self._drop_claims(holder, lambda claim: True)
 
     def _drop_dead(self, holder: Cell, *, told: bool = False) -> None:
         """Free what the ended lives of an actor held; if it was `told`, a stand-in has ended whatever it looks like."""
@@ -454,8 +461,15 @@ class RegistryActor(Actor):
         for entry in list(holdings.entries):
             if sure or not is_living(holder, entry.life):
                 self._remove(entry, ended=True)
+        self._drop_claims(holder, lambda claim: sure or not is_living(holder, claim.life))
+
+    def _drop_claims(self, holder: Cell, is_over: Callable[[Claim], bool]) -> None:
+        """Have an actor give up locks that it has, and no more wait for others."""
+        holdings = self._book.holders.get(holder)
+        if holdings is None:
+            return
         for claim in list(holdings.claims):
-            if claim in holdings.claims and (sure or not is_living(holder, claim.life)):
+            if claim in holdings.claims and is_over(claim):
                 self._give_up(claim)
 
     def _sender(self) -> Cell:

@@ -245,6 +245,8 @@ class Registry(Generic[K, V]):
         finally:
             try:
                 self.ref.tell(Unlock(packed, ticket))  # Also if it was not granted, or was and we did not wait for it.
+                if ctx is not None:
+                    await ctx.flush()  # A recorded turn that crashes takes back what has not left.
             except ActorStopped:  # This life is over, and its locks with it.
                 pass
 

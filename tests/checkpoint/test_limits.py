@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 from typing import Any
 
+import pytest
+
 import holdfast as hf
 from tests.checkpoint.players import Doer, Note, Seen, Sink, start, until
 from tests.checkpoint.strikes import NEVER, strike
@@ -46,6 +48,30 @@ async def test_children_spawned_before_the_snapshot_do_not_come_back(isolation: 
         assert await ref.ask(Seen(), timeout=30.0) == ["child1", "child2", "first"]
         await recovered(system, ref)
         assert await ref.ask(Seen(), timeout=30.0) == ["child2", "first"]
+
+
+class Name(hf.Message[str]): ...
+
+
+class Reborn(hf.Actor):
+    """Gives each child the name of the one before, which has ended."""
+
+    @hf.on(Name)
+    def spawn(self, message: Name) -> str:
+        return self.ctx.spawn(hf.start(Sink), "child").path
+
+
+async def test_a_turn_that_gives_a_child_the_name_of_one_that_has_ended_cannot_be_replayed() -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        spec = hf.child("reborn", hf.start(Reborn), recovery=hf.hybrid(interval=NEVER))
+        await system.start(hf.supervisor("house", children=[spec], restart="temporary"))
+        ref = system.ref("/app/house/reborn", Reborn)
+        path = await ref.ask(Name(), timeout=30.0)
+        await system.terminate(system.ref(path, Sink))
+        assert await ref.ask(Name(), timeout=30.0) == path
+        ref.kill()
+        with pytest.raises(hf.errors.ActorStopped, match=r"diverged at turn 2.*NameTaken"):
+            await ref.ask(Name(), timeout=30.0)
 
 
 async def test_a_suspension_ends_with_the_life(isolation: str, store: str | None) -> None:

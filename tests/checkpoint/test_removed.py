@@ -28,6 +28,7 @@ BETWEEN = "tests/checkpoint/test_between_lives.py"
 TIES = "tests/checkpoint/test_ties_of_an_address.py"
 ORDER = "tests/checkpoint/test_order.py"
 REGISTRY = "tests/supervision/test_registry_recorded.py"
+REGISTRY_PROTECTED = "tests/supervision/test_registry_protected.py"
 ORDERS = "tests/checkpoint/test_restart_orders.py"
 RUNTIME = "tests/checkpoint/test_asks_of_the_runtime.py"
 TO_THE_GONE = "tests/checkpoint/test_ties_to_the_gone.py"
@@ -225,6 +226,34 @@ CHECKS = {
         "",
         REGISTRY,
         "moves_with_it",
+    ),
+    "a lock is given back whatever becomes of the turn": Check(
+        "supervision/services/registry.py",
+        "                    await ctx.flush()",
+        "                    pass",
+        REGISTRY_PROTECTED,
+        "has_crashed and hybrid and inside",
+    ),
+    "a lock of a turn that nobody goes on with is free": Check(
+        "supervision/services/registrar.py",
+        "            self._drop_claims(holder, lambda claim: True)\n",
+        "            pass\n",
+        REGISTRY_PROTECTED,
+        "over_a_kill and checkpoint_only",
+    ),
+    "and so it is below a supervisor with a process of its own": Check(
+        "checkpoint/life/child_stub.py",
+        "        return self._keeps_turns\n",
+        "        return False\n",
+        REGISTRY_PROTECTED,
+        "over_a_kill and hybrid-process and not pbr",
+    ),
+    "a lock of a turn that is gone on with is kept": Check(
+        "supervision/services/registrar.py",
+        " and not holder.host.home.keeps_turns:",
+        ":",
+        REGISTRY_PROTECTED,
+        "over_a_kill and hybrid and not pbr and not process",
     ),
     "a recorded holder that has ended is not found": Check(
         "supervision/services/registrar.py",

@@ -298,3 +298,77 @@ async def test_what_hooks_change_between_two_turns_comes_to_the_other_replica(ki
         os.kill(pid_of(system, ref, primary), signal.SIGKILL)
         assert await ref.ask(Count(), timeout=25.0) == 3
         assert await ref.ask(Lives(), timeout=25.0) == (3, returns + 1)
+
+
+class Hello(hf.Message[None]):
+    by: str
+
+
+class Heard(hf.Message[list[tuple[str, str]]]): ...
+
+
+class Hall(hf.Actor):
+    """Writes down who has said what."""
+
+    def __init__(self) -> None:
+        self.heard: list[tuple[str, str]] = []
+
+    @hf.subscribe("/hello")
+    @hf.on(Hello)
+    def hello(self, message: Hello) -> None:
+        sender = self.ctx.sender
+        self.heard.append((message.by, "nobody" if sender is None else sender.path))
+
+    @hf.on(Heard)
+    def read(self, message: Heard) -> list[tuple[str, str]]:
+        return self.heard
+
+
+class Saluting(hf.Actor):
+    hall: hf.Binding[Hall]
+
+    def __init__(self) -> None:
+        self.count = 0
+
+    async def on_start(self, restored: bool) -> None:
+        self.hall.tell(Hello("tell"))
+        await self.hall.send(Hello("send"))
+        await self.hall.ask(Hello("ask"))
+        await self.ctx.publish("/hello", Hello("publish"))
+
+    @hf.on(Count)
+    def add(self, message: Count) -> int:
+        self.count += 1
+        return self.count
+
+    @hf.on(Boom)
+    def crash(self, message: Boom) -> None:
+        raise RuntimeError("as told")
+
+
+@pytest.mark.parametrize("recovery", [None, hf.hybrid(interval=3600.0)], ids=["fresh", "hybrid"])
+@pytest.mark.parametrize("mechanism", [hf.ftm.PBR(), hf.ftm.LFR(), hf.ftm.TR()], ids=["pbr", "lfr", "tr"])
+async def test_what_a_hook_says_in_a_later_life_comes_from_the_address_that_is_protected(
+    mechanism: Any, recovery: hf.Method | None
+) -> None:
+    async with hf.ActorSystem("app", log=False, intensity=1000) as system:
+        hall = await system.start(hf.child("hall", hf.start(Hall)))
+        await system.start(hf.supervisor("attic"))
+        spec = hf.child("a", hf.start(Saluting), bindings={"hall": hall.path}, mechanism=mechanism, recovery=recovery)
+        ref = await system.start(spec)
+        for how in ("crash", "kill", "move"):
+            if recovery is not None:  # Else the first start is handled again, as a turn.
+                await system.checkpoint(ref, timeout=60.0)
+            before = len(await hall.ask(Heard()))
+            if how == "move":
+                async with system.transaction(timeout=60.0) as change:
+                    change.move(ref, "/app/attic")
+            if how == "kill":
+                ref.kill()
+            else:
+                with pytest.raises(hf.RemoteCrash):
+                    await ref.ask(Boom(), timeout=60.0)
+            assert await ref.ask(Count(), timeout=60.0) >= 1
+            heard = (await hall.ask(Heard()))[before:]
+            path = "/app/attic/a" if how == "move" else "/app/a"
+            assert set(heard) == {(verb, path) for verb in ("tell", "send", "ask", "publish")}, how

@@ -27,6 +27,13 @@ CHECKS = {
         HOSTILE,
         "test_the_order_of_a_leader and kill and pbr",
     ),
+    "what a hook says comes from the protected address": Check(
+        "ftm/replica/replica_life.py",
+        "        self._speaker = self._cell.node.cell_at(self.path)\n",
+        "        pass\n",
+        "tests/ftm/test_hooks.py",
+        "later_life and pbr and fresh",
+    ),
     "what a leader lets out is looked at as what any process lets out": Check(
         "ftm/group/proxy.py",
         "        if not self._may_leave(message):\n",

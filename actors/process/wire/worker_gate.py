@@ -233,8 +233,10 @@ class WorkerGate:
         if sender is not None and sender not in self._own:
             if type(sender) is str:
                 sender = frame.sender = self._introduce(sender)
-            self.require_own(self._worker.connection.names.from_wire(sender), "a message")
-            self._own.add(sender)
+            path = self._worker.connection.names.from_wire(sender)
+            self.require_voice(path, "a message")
+            if self.owns(path):
+                self._own.add(sender)
 
     def target(self, to: frames.Name) -> Cell:
         """The cell that a message is for.
