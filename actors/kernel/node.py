@@ -30,7 +30,7 @@ from ..errors import (
 from ..events import DeadLetter, Event, EventHub, SupervisorGaveUp
 from ..exit_reasons import ExitReason
 from ..persistence import Keeper, NothingKept
-from ..values.path_parts import check_beside, check_path_part
+from ..values.path_parts import can_be_written, check_beside, check_path_part
 from . import lifecycle
 from .actor import Actor, Start
 from .blocking_handlers import HandlerThreads
@@ -100,7 +100,8 @@ class Ports:
 
 def check_sought(path: object, kind: object) -> None:
     """Whether this is an address, and the class of who is to live there. Raises SpecError."""
-    if not isinstance(path, str) or not isinstance(kind, type) or not issubclass(kind, Actor):
+    is_address = isinstance(path, str) and can_be_written(path)
+    if not is_address or not isinstance(kind, type) or not issubclass(kind, Actor):
         raise SpecError("find", f"takes an address and the class of an actor, not {shown(path)} and {shown(kind)}")
 
 
