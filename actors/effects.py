@@ -15,9 +15,17 @@ from typing import Any, Final, Literal, NamedTuple, TypeAlias
 import msgspec
 
 from .backoff import Backoff
-from .errors import EffectFailed, EffectInDoubt, HoldfastError, SpecError, error_text, shown, type_name
+from .errors import (
+    EffectFailed,
+    EffectInDoubt,
+    HoldfastError,
+    SpecError,
+    can_be_written,
+    error_text,
+    shown,
+    type_name,
+)
 from .seconds import check_seconds
-from .values.path_parts import can_be_written
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

@@ -24,13 +24,14 @@ from ..errors import (
     StartFailed,
     UnknownMessage,
     WrongActor,
+    can_be_written,
     shown,
     type_name,
 )
 from ..events import DeadLetter, Event, EventHub, SupervisorGaveUp
 from ..exit_reasons import ExitReason
 from ..persistence import Keeper, NothingKept
-from ..values.path_parts import can_be_written, check_beside, check_path_part
+from ..values.path_parts import check_beside, check_path_part
 from . import lifecycle
 from .actor import Actor, Start
 from .blocking_handlers import HandlerThreads

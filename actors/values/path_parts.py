@@ -10,7 +10,6 @@ from ..errors import SpecError, shown
 CONTROL: Final = (*range(32), *range(127, 160), 0x200E, 0x200F, *range(0x2028, 0x202F), *range(0x2066, 0x206A))
 """Code points that make a terminal do something, end a line, or make a line look like another one."""
 _CONTROL: Final = re.compile(f"[{re.escape(''.join(map(chr, CONTROL)))}\ud800-\udfff]")
-_HALF: Final = re.compile("[\ud800-\udfff]")
 LONGEST: Final = 1024
 """Characters of a name."""
 
@@ -26,15 +25,6 @@ def has_control(text: str) -> bool:
     (True, False)
     """
     return _CONTROL.search(text) is not None
-
-
-def can_be_written(text: str) -> bool:
-    """Whether a text can be recorded and sent: half of a surrogate pair cannot, as in file names that are not UTF-8.
-
-    >>> can_be_written("żółw\\n"), can_be_written("a\\ud800b")
-    (True, False)
-    """
-    return _HALF.search(text) is None
 
 
 def check_path_part(where: str, what: str, name: object) -> None:
