@@ -15,7 +15,16 @@ from typing import Any, Final, Literal, NamedTuple, TypeAlias
 import msgspec
 
 from .backoff import Backoff
-from .errors import EffectFailed, EffectInDoubt, HoldfastError, SpecError, error_text, type_name
+from .errors import (
+    EffectFailed,
+    EffectInDoubt,
+    HoldfastError,
+    SpecError,
+    can_be_written,
+    error_text,
+    shown,
+    type_name,
+)
 from .seconds import check_seconds
 
 
@@ -242,8 +251,8 @@ def effect_of(
         raise SpecError("effect", f"retry must be a Retry, or None, not {retry!r}")
     if at_most_once and retry is not None and retry.attempts > 1:
         raise SpecError("effect", "what is performed at most once is not attempted again: leave `retry` out")
-    if not isinstance(key, str):
-        raise SpecError("effect", f"key must be a str, not {key!r}")
+    if not isinstance(key, str) or not can_be_written(key):
+        raise SpecError("effect", f"key must be text that can be written, not {shown(key)}")
     if isolation not in ("thread", "process"):
         raise SpecError("effect", f"isolation must be 'thread' or 'process', not {isolation!r}")
     if isolation == "process" and is_async:

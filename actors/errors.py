@@ -583,6 +583,15 @@ def shown(value: object) -> str:
         return f"<a {type_name(type(value))} that cannot be shown: {type_name(type(broken))}>"
 
 
+def can_be_written(text: str) -> bool:
+    """Whether a text can be recorded and sent: half of a surrogate pair cannot, as in file names that are not UTF-8.
+
+    >>> can_be_written("żółw\\n"), can_be_written("a\\ud800b")
+    (True, False)
+    """
+    return text.isascii() or text.encode(errors="ignore").decode() == text
+
+
 def portable(text: str) -> str:
     """Text that can cross any border: not longer than `LONGEST_TEXT`, and without halves of surrogate pairs.
 

@@ -40,7 +40,7 @@ from .envelope import (
 )
 from .links import Monitor
 from .message import Message, reply_type, require_message
-from .ref import cell_of
+from .ref import cell_of, current
 from .timers import LoopTimer, Timer
 from .topics import NOT_TAKEN, publish
 
@@ -787,9 +787,10 @@ class ActorContext:
         return task
 
     def _beside(self, work: Coroutine[Any, Any, T], what: str) -> asyncio.Task[T]:
-        """A task of this life, which knows in what turn it was begun."""
+        """A task of this life, which knows in what turn it was begun; what it sends is the actor's."""
         tasks, context = self._cell.extra().belongings.tasks, copy_context()
         context.run(begun_in.set, self._item)
+        context.run(current.set, self)  # Who begins it may be none of its turns, such as the order to make an effect.
         task = self._cell.node.loop.create_task(contained(work), name=f"{what} of {self.path}", context=context)
         tasks.add(task)
 

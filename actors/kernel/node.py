@@ -24,6 +24,7 @@ from ..errors import (
     StartFailed,
     UnknownMessage,
     WrongActor,
+    can_be_written,
     shown,
     type_name,
 )
@@ -100,7 +101,8 @@ class Ports:
 
 def check_sought(path: object, kind: object) -> None:
     """Whether this is an address, and the class of who is to live there. Raises SpecError."""
-    if not isinstance(path, str) or not isinstance(kind, type) or not issubclass(kind, Actor):
+    is_address = isinstance(path, str) and can_be_written(path)
+    if not is_address or not isinstance(kind, type) or not issubclass(kind, Actor):
         raise SpecError("find", f"takes an address and the class of an actor, not {shown(path)} and {shown(kind)}")
 
 

@@ -252,14 +252,14 @@ class RecordedContext(ActorContext):
         self.recorded.stage.trace = tail
 
     def _in_turn(self) -> bool:
-        """Whether this code runs in the turn in hand, not in a background task."""
+        """Whether this code runs in the turn in hand, not in a background task or a thread."""
         return self.recorded.feed is not None and not _in_background()
 
     def acting(self) -> Life:
         """The life, whose turn or hook it must be that runs.
 
         Raises:
-            HoldfastError: this is `__init__`, or a background task.
+            HoldfastError: this is `__init__`, a background task, or the function of an effect.
         """
         if not self._in_turn():
             self._outside()
@@ -274,17 +274,21 @@ class RecordedContext(ActorContext):
             raise HoldfastError(f"{self.path}: {why}; act in on_start, or in on_recovered")
         if not life.hook or _in_background():
             raise HoldfastError(
-                f"{self.path}: background tasks of a recorded actor may not send, nor use ctx.effect or ctx.sleep "
-                "(asyncio.gather makes one of a coroutine); report with ctx.pipe_to_self()"
+                f"{self.path}: background tasks of a recorded actor, and functions of its effects, may not send, "
+                "nor use ctx.effect or ctx.sleep (asyncio.gather makes a task of a coroutine); report with "
+                "ctx.pipe_to_self(), or by what the effect returns"
             )
 
     def now(self) -> float:
         life = self.recorded
-        return self._cell.node.clock.wall() if life.feed is None else max(life.feed.time, life.waits.moment)
+        if life.feed is None or _in_background():
+            return self._cell.node.clock.wall()
+        return max(life.feed.time, life.waits.moment)
 
     @property
     def random(self) -> Random:
-        return self._draw()
+        """The numbers of the turn in hand, or of the hook; who draws beside it, which no replay repeats, has others."""
+        return super().random if _in_background() else self._draw()
 
     def _draw(self, what: str = "") -> Random:
         """The numbers of the turn in hand, which are the same each time it runs."""
@@ -513,14 +517,22 @@ class RecordedContext(ActorContext):
 
     @types.coroutine
     def _stepped(self, turn: int, work: Coroutine[Any, Any, None]) -> Generator[Any, Any, None]:
-        """Step what works for a turn that waits: if a step ends the process, the turn has ended it."""
+        """Step what works for a turn that waits: if a step ends the process, the turn has ended it.
+
+        A step that cancels the task has failed by that, as if it had raised: nobody else wants the task to end.
+        """
         step: Callable[[], Any] = functools.partial(work.send, None)
+        task = asyncio.current_task()
+        assert task is not None
         while True:
+            wanted = task.cancelling()
             try:
                 with self.recorded.work_beside(turn):
                     waiting = step()
             except StopIteration:
                 return
+            while task.cancelling() > wanted:
+                task.uncancel()
             try:
                 step = functools.partial(work.send, (yield waiting))
             except GeneratorExit:
@@ -729,11 +741,11 @@ class RecordedContext(ActorContext):
 
 
 def _in_background() -> bool:
-    """Whether this code runs in a task of its own."""
+    """Whether this code runs in a task of its own, or in a thread."""
     try:
         task = asyncio.current_task()
-    except RuntimeError:
-        return False
+    except RuntimeError:  # No loop runs here.
+        return True
     return task is not None and task.get_name() != "holdfast runner"
 
 

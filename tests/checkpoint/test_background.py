@@ -116,3 +116,60 @@ async def test_cancelled_work_is_a_failure_that_can_be_taken(method: hf.Method |
                 await asyncio.sleep(0)
         if method is not None:
             await system.checkpoint(worker, timeout=30.0)
+
+
+class Draw(hf.Message[str]):
+    how: str
+
+
+class Drawn(hf.Message):
+    number: float
+
+
+class Said(hf.Message[list[str]]): ...
+
+
+class Drawing(hf.Actor):
+    """Draws beside the turn, and then in the turn."""
+
+    def __init__(self) -> None:
+        self.said: list[str] = []
+        self._drawn = asyncio.Event()
+
+    def draw(self) -> float:
+        return self.ctx.random.random() + len(str(self.ctx.uuid()))
+
+    async def draw_beside(self) -> float:
+        number = self.draw()
+        self._drawn.set()
+        return number
+
+    @hf.on(Draw)
+    async def draws(self, message: Draw) -> str:
+        match message.how:
+            case "effect":
+                await self.ctx.effect(self.draw_beside)
+            case "thread":
+                await self.ctx.effect(self.draw)
+            case "task":
+                self.ctx.pipe_to_self(self.draw_beside(), Drawn)
+                await self.ctx.effect(self._drawn.wait)
+        self.said.append(f"{self.ctx.random.random()} {self.ctx.uuid()}")
+        return self.said[-1]
+
+    @hf.on(Drawn)
+    def drawn(self, message: Drawn) -> None: ...
+
+    @hf.on(Said)
+    def tell(self, message: Said) -> list[str]:
+        return self.said
+
+
+@pytest.mark.parametrize("how", ["effect", "thread", "task"])
+async def test_who_draws_beside_the_turn_takes_no_number_from_it(how: str, isolation: str) -> None:
+    """A replay, in which nobody draws beside it, would see others, and go another way."""
+    async with hf.ActorSystem("app", log=False, intensity=1000) as system:
+        ref = await start(system, isolation, "drawing", hf.start(Drawing), recovery=hf.hybrid(interval=3600.0))
+        said = await ref.ask(Draw(how), timeout=30.0)
+        ref.kill()
+        assert await ref.ask(Said(), timeout=30.0) == [said]

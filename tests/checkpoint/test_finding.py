@@ -75,6 +75,22 @@ async def test_another_class_is_refused(system: hf.ActorSystem) -> None:
         await ref.ask(Tell(notes.path))
 
 
+class Careless(hf.Actor):
+    @hf.on(Tell)
+    def tell(self, message: Tell) -> int:
+        try:
+            self.ctx.find(f"{message.to}\ud800", hf.Actor).tell(Note(""))
+        except hf.SpecError:
+            return 0
+        return 1
+
+
+async def test_an_address_that_cannot_be_written_is_refused(system: hf.ActorSystem, isolation: str) -> None:
+    """What is told to it could be neither recorded nor sent, and each life would end in this turn."""
+    ref = await start(system, isolation, "careless", hf.start(Careless), recovery=hf.hybrid())
+    assert await ref.ask(Tell("/app/half of a pair: "), timeout=30.0) == 0
+
+
 class Bound(hf.Actor):
     sink: hf.Binding[Sink]
 

@@ -15,6 +15,7 @@ CHUNKS_KEPT = "tests/checkpoint/test_chunks_kept.py"
 FINDING = "tests/checkpoint/test_finding.py"
 KILLS = "tests/checkpoint/test_kill_counts.py"
 
+EFFECTS = "tests/effects/test_effects.py"
 RACES = "tests/effects/test_races.py"
 RACE_PROGRAMS = "tests/effects/test_race_programs.py"
 CHANGES = "tests/effects/test_changes_of_races.py"
@@ -170,6 +171,48 @@ CHECKS = {
         "return not self._may_return(at)",
         TO_THE_GONE,
         "may_come_back and listed",
+    ),
+    "what an effect sends is its actor's, wherever that lives": Check(
+        "actors/kernel/context.py",
+        "        context.run(current.set, self) ",
+        "        #",
+        EFFECTS,
+        "may_not_send and process and True",
+    ),
+    "a thread is no turn": Check(
+        "checkpoint/life/recorded_context.py",
+        "    except RuntimeError:  # No loop runs here.\n        return True\n",
+        "    except RuntimeError:\n        return False\n",
+        EFFECTS,
+        "may_not_send and task and False",
+    ),
+    "who draws beside a turn takes no number from it": Check(
+        "checkpoint/life/recorded_context.py",
+        "return super().random if _in_background() else self._draw()\n",
+        "return self._draw()\n",
+        "tests/checkpoint/test_background.py",
+        "draws_beside_the_turn and task",
+    ),
+    "an effect that cancels its own task is not withdrawn": Check(
+        "checkpoint/life/recorded_context.py",
+        "                task.uncancel()\n",
+        "                break\n",
+        EFFECTS,
+        "cancels_its_own_task and task",
+    ),
+    "a key of an effect can be recorded": Check(
+        "actors/effects.py",
+        " or not can_be_written(key):",
+        ":",
+        EFFECTS,
+        "what_is_wrong and key",
+    ),
+    "an address that is found can be recorded": Check(
+        "actors/kernel/node.py",
+        " and can_be_written(path)\n",
+        "\n",
+        FINDING,
+        "cannot_be_written and task",
     ),
     "an order is an output of its turn": Check(
         "checkpoint/life/recorded_context.py",
@@ -1120,7 +1163,7 @@ CHECKS = {
         "checkpoint/home/outputs.py",
         "batch.after.append(lambda: self._begin(turn, key, out, port))",
         "self._begin(turn, key, out, port)",
-        "tests/effects/test_effects.py",
+        EFFECTS,
         "test_an_effect_waits_until_all_before_it_is_safe",
     ),
     "what a life has wanted to wait for begins with that life only": Check(
@@ -1169,35 +1212,35 @@ CHECKS = {
         "checkpoint/home/pending_asks.py",
         "        if is_out and place not in self.asks:\n",
         "        if place not in self.asks:\n",
-        "tests/effects/test_effects.py",
+        EFFECTS,
         "test_what_nobody_has_ordered_is_no_outcome",
     ),
     "what is made at most once is not made again": Check(
         "checkpoint/home/pending_asks.py",
         "        if out.name:\n",
         "        if False:\n",
-        "tests/effects/test_effects.py",
+        EFFECTS,
         "test_one_that_is_made_at_most_once",
     ),
     "the replay of a turn that has ended makes no effect": Check(
         "checkpoint/home/pending_asks.py",
         "        if turn <= home.ledger.turn:\n            return  # Its turn has ended without waiting",
         "        if False:\n            return  # Its turn has ended without waiting",
-        "tests/effects/test_effects.py",
+        EFFECTS,
         "test_what_a_turn_has_left_without_an_outcome",
     ),
     "a task beside the turn has no effect": Check(
         "checkpoint/life/recorded_context.py",
         "            self._outside()\n            return super()._performed(effect)",
         "            return super()._performed(effect)",
-        "tests/effects/test_effects.py",
+        EFFECTS,
         "test_a_task_beside_the_turn_has_none and effect",
     ),
     "an effect whose handler does not wait any more comes to nothing": Check(
         "checkpoint/life/recorded_context.py",
         "        outcome.add_done_callback(lambda _: task.cancel())  # The handler",
         "        _ = task  # The handler",
-        "tests/effects/test_effects.py",
+        EFFECTS,
         "test_an_effect_ends_when_its_handler",
     ),
     "a message that a turn has waited for is no input any more": Check(

@@ -16,6 +16,7 @@ import holdfast as hf
 from holdfast.actors.values import encode_value
 from holdfast.checkpoint.home.recorded_home import switch_of
 from holdfast.checkpoint.protocol import REPLY, Answer, Performed
+from tests.checkpoint.players import start
 from tests.checkpoint.test_commits import Slow
 from tests.effects.clerk import IN_TIME, Clerk, Do, Done, No, clerk, deed, lines, words
 
@@ -190,6 +191,7 @@ class Strange(hf.Actor):
             ((str,), {"timeout": True}),
             ((str,), {"retry": 3}),
             ((str,), {"key": 3}),
+            ((str,), {"key": "a file \udcff"}),
             ((str,), {"at_most_once": True, "retry": hf.Retry()}),
         ]
         args, options = calls[message.which]
@@ -202,7 +204,7 @@ class Strange(hf.Actor):
 
 @pytest.mark.parametrize(
     ("which", "says"),
-    list(enumerate(["function", "timeout", "timeout", "timeout", "retry", "key", "at most once"])),
+    list(enumerate(["function", "timeout", "timeout", "timeout", "retry", "key", "key", "at most once"])),
 )
 @pytest.mark.parametrize("recovery", [hf.fresh(), hf.hybrid()])
 async def test_what_is_wrong_is_said_at_the_call(recovery: Any, which: int, says: str) -> None:
@@ -219,7 +221,8 @@ def test_a_wrong_retry_is_refused(options: dict[str, Any]) -> None:
         hf.Retry(**options)
 
 
-class Sneak(hf.Message[str]): ...
+class Sneak(hf.Message[str]):
+    is_async: bool
 
 
 class Sneaky(hf.Actor):
@@ -230,11 +233,14 @@ class Sneaky(hf.Actor):
 
     @hf.on(Sneak)
     async def sneak(self, message: Sneak) -> str:
-        async def tell() -> None:
+        def tell() -> None:
             self.ctx.ref.tell(Done())
 
+        async def tell_async() -> None:
+            tell()
+
         try:
-            await self.ctx.effect(tell)
+            await self.ctx.effect(tell_async if message.is_async else tell)
         except hf.HoldfastError as error:
             return str(error)
         return "told"
@@ -242,13 +248,22 @@ class Sneaky(hf.Actor):
     @hf.on(Done)
     def done(self, message: Done) -> list[str]:
         self.told += 1
-        return []
+        return [str(self.told)]
 
 
-async def test_an_effect_may_not_send_in_the_name_of_the_actor() -> None:
+@pytest.mark.parametrize("is_async", [True, False])
+@pytest.mark.parametrize("place", ["task", "process", "subtree", "PBR", "LFR", "TR"])
+async def test_an_effect_may_not_send_in_the_name_of_the_actor(place: str, is_async: bool) -> None:
+    """Wherever the actor lives, on the loop and in a thread: a replay, which makes no effect, would send nothing."""
+    options: Any = {"recovery": hf.hybrid(interval=1000.0)}
+    if hasattr(hf.ftm, place):
+        place, options["mechanism"] = "task", getattr(hf.ftm, place)()
     async with hf.ActorSystem("app", log=False) as system:
-        ref = await system.start(hf.child("sneaky", hf.start(Sneaky), recovery=hf.hybrid()))
-        assert "may not send" in await ref.ask(Sneak())
+        ref = await start(system, place, "sneaky", hf.start(Sneaky), **options)
+        assert "may not send" in await ref.ask(Sneak(is_async), IN_TIME)
+        assert await ref.ask(Done(), IN_TIME) == ["1"]
+        ref.kill()
+        assert await ref.ask(Done(), IN_TIME) == ["2"]
 
 
 class Gather(hf.Message[list[str]]):
@@ -459,6 +474,31 @@ async def test_whatever_an_effect_raises_is_its_outcome(name: str, isolation: An
                 assert RAISED[name][1] in said
             assert await ref.ask(Done(), IN_TIME) == []
             assert not [event for event in stream.take() if isinstance(event, hf.events.ActorCrashed)]
+
+
+async def cancel_itself() -> None:
+    """As a library does that takes the task of the effect for its own."""
+    task = asyncio.current_task()
+    assert task is not None
+    task.cancel()
+    await asyncio.sleep(0)
+
+
+class Cancelling(Clerk):
+    @hf.on(Begin)
+    async def begin(self, message: Begin) -> int:
+        with pytest.raises(hf.errors.EffectFailed, match="CancelledError"):
+            await self.ctx.effect(cancel_itself)
+        return 1
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_an_effect_that_cancels_its_own_task_has_failed(isolation: Any) -> None:
+    """Nobody else wants it to end, and the turn waits for an outcome."""
+    async with hf.ActorSystem("app", log=False) as system:
+        spec = hf.child("clerk", hf.start(Cancelling), isolation=isolation, recovery=hf.hybrid(interval=1000.0))
+        ref = await system.start(spec)
+        assert await ref.ask(Begin(), IN_TIME) == 1
 
 
 async def test_what_nobody_has_ordered_is_no_outcome(tmp_path: Path, world: str) -> None:
