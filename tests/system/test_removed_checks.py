@@ -38,6 +38,7 @@ CHANGES = "tests/effects/test_changes_of_races.py"
 ORDERS = "tests/effects/test_orders_while_resting.py"
 RESTING = "tests/effects/test_moves_while_resting.py"
 CIRCLES = "tests/actors/test_circles.py"
+THREADS = "tests/system/test_threads.py"
 LINKS = "tests/actors/test_links.py"
 TURNS = "tests/supervision/test_turn_timeout.py"
 EFFECTS = "tests/effects/test_effect_processes.py"
@@ -60,6 +61,34 @@ SETTERS = "tests/checkpoint/test_own_setters.py"
 DECLARED = "tests/supervision/test_declared_classes.py"
 
 CHECKS = {
+    "who asks from another loop is refused while the system has something to do": Check(
+        "actors/kernel/loop.py",
+        "        if self.is_other_loop():\n            raise WrongLoop(path)\n",
+        "",
+        THREADS,
+        "something_to_do and task",
+    ),
+    "who tells a recorded actor from another loop is refused": Check(
+        "checkpoint/home/switch.py",
+        "if get_ident() != node.thread or running_loop() is not node.loop:",
+        "if get_ident() != node.thread:",
+        THREADS,
+        "something_to_do and durable",
+    ),
+    "a system is not used from another loop": Check(
+        "system/system.py",
+        "        if self._running.is_other_loop():\n",
+        "        if False:\n",
+        THREADS,
+        "something_to_do and task",
+    ),
+    "a system is not ended from another loop": Check(
+        "system/system.py",
+        "        node.check_caller(root.path)\n",
+        "",
+        THREADS,
+        "something_to_do and task",
+    ),
     "what a system lacks before it is entered says so": Check(
         "system/system.py",
         "            if name in MADE_WITH_NODE:\n",
