@@ -61,6 +61,20 @@ SETTERS = "tests/checkpoint/test_own_setters.py"
 DECLARED = "tests/supervision/test_declared_classes.py"
 
 CHECKS = {
+    "who is away with its supervisor in a process is no error": Check(
+        "checkpoint/protocol.py",
+        "    comes_back: bool = True\n",
+        "",
+        TEXTS,
+        "test_who_is_away_with_its_supervisor",
+    ),
+    "when the system has ended nobody is restarted": Check(
+        "actors/kernel/lifecycle.py",
+        "return parent_ended(cell) and not mailbox.is_over(cell.node)",
+        "return parent_ended(cell)",
+        TEXTS,
+        "test_who_is_away_with_its_supervisor",
+    ),
     "who asks from another loop is refused while the system has something to do": Check(
         "actors/kernel/loop.py",
         "        if self.is_other_loop():\n            raise WrongLoop(path)\n",
