@@ -427,8 +427,8 @@ CHECKS = {
     ),
     "another event loop of the thread is refused": Check(
         "actors/kernel/loop.py",
-        "        if not self.loop.is_running() and running_loop() is not None:\n",
-        "        if False:\n",
+        "        if not self.is_own_thread() or self.is_other_loop():\n",
+        "        if not self.is_own_thread():\n",
         "tests/system/test_threads.py",
         "another_event_loop_of_the_thread and tell",
     ),
