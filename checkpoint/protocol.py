@@ -515,7 +515,7 @@ class Wanted(msgspec.Struct, array_like=True, tag=17):
     """A supervisor in another process wants to start a child whose home is at the root, or that is lived there.
 
     `bindings` says where those of the child lead, port to address; `register` is the name that its spec gives it;
-    `made_up` whether its id was.
+    `made_up` whether its id was, `comes_back` whether it is started again when its supervisor has been.
     """
 
     number: int
@@ -529,6 +529,7 @@ class Wanted(msgspec.Struct, array_like=True, tag=17):
     made_up: bool = False
     goes_on: bool = True
     """Whether the end of its last life is followed by one that goes on where it was; the root takes it down."""
+    comes_back: bool = True
 
     def restarts(self, reason: ExitReason) -> bool:
         """Whether another life follows, as its supervisor has said."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast, get_args, overload
 
 from ..actors.control.drain import drain as drain_queue
 from ..actors.control.wait_watch import WaitWatch
-from ..actors.errors import ActorStopped, HoldfastError, NoSuchActor, SpecError, StoreError, TreeFailed
+from ..actors.errors import ActorStopped, HoldfastError, NoSuchActor, SpecError, StoreError, TreeFailed, WrongLoop
 from ..actors.events import EventStream, LeadershipTaken, RecoveryTableUnused, ServersAnswer, ServersSilent, StandingBy
 from ..actors.exit_reasons import SHUTDOWN, ExitReason, Shutdown, check_reason, pack_exit, raised_in
 from ..actors.kernel import lifecycle
@@ -425,10 +425,15 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
         self._refuse_deposed(error, self._homes.journal.engine)
 
     async def shutdown(self) -> None:
-        """Stop every actor, newest first, and what belongs to the system. A second call changes nothing."""
+        """Stop every actor, newest first, and what belongs to the system. A second call changes nothing.
+
+        Raises:
+            WrongThread, WrongLoop: it was opened in another thread, or in another event loop, which has to end it.
+        """
         root, node = self._root, self._running
         if root is None or node is None:
             return
+        node.check_caller(root.path)
         self._body = None
         if self._closing is None:
             self._closing = node.loop.create_task(self._close(root, node), name=f"shutdown of {self.name}")
@@ -575,9 +580,15 @@ class ActorSystem(Recorded, Controls, HistoryCalls, LineCalls):
 
     @property
     def _node(self) -> Node:
-        """The node that hosts this process's actors."""
+        """The node that hosts this process's actors.
+
+        Raises:
+            WrongLoop: another loop of its thread runs; some of it, as its numbers, may be read from other threads.
+        """
         if self._running is None:
             raise self._not_running()
+        if self._running.is_other_loop():
+            raise WrongLoop(f"/{self.name}")
         return self._running
 
     def _not_running(self) -> HoldfastError:

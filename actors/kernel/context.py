@@ -206,7 +206,7 @@ class ActorContext:
 
     def _order(self, cell: Cell, order: Order) -> None:
         """A stop or kill by way of a ref."""
-        cell.node.check_thread(cell.path)
+        cell.node.check_caller(cell.path)
         note_order(self._cell, cell)
         cell.obey(order, self.path)
 

@@ -115,7 +115,7 @@ class NearParent(Parent):
         return start.kind._topics if start is not None else ()
 
     def is_restarting(self, cell: Cell) -> bool:
-        return parent_ended(cell)
+        return may_live_again(cell)
 
 
 def _strike(cell: Cell, life: int) -> None:
@@ -707,12 +707,18 @@ def parent_ended(cell: Cell) -> bool:
     return True
 
 
+def may_live_again(cell: Cell) -> bool:
+    """Whether an actor is away because its supervisor is, and the system goes on."""
+    return parent_ended(cell) and not mailbox.is_over(cell.node)
+
+
 def nobody_at(cell: Cell) -> ActorStopped:
     """What whoever wants something of an actor that is not there gets."""
-    restarting = parent_ended(cell)
-    return ActorStopped(
-        cell.path, "its supervisor is being restarted, and may start it again" if restarting else "nobody lives there"
-    )
+    if may_live_again(cell):
+        why = "its supervisor has ended, and may start it again"
+    else:
+        why = mailbox.SYSTEM_ENDED if mailbox.is_over(cell.node) else "nobody lives there"
+    return ActorStopped(cell.path, why)
 
 
 class ChildExit(Item):

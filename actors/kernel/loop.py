@@ -75,10 +75,8 @@ class RunLoop:
                 is found here, where it costs nothing while actors are busy; what it has queued is taken back.
             WrongLoop: by whoever runs in another loop of this thread; found in the same place.
         """
-        if get_ident() != self.thread:
-            raise WrongThread(self._take_back(), threading.current_thread().name)
-        if not self.loop.is_running() and running_loop() is not None:
-            raise WrongLoop(self._take_back())
+        if not self.is_own_thread() or self.is_other_loop():
+            self.check_caller(self._take_back())
         self.awake = True
         self.loop.call_soon(self._drain)
 
@@ -139,14 +137,20 @@ class RunLoop:
         """Whether this is the thread that the actors of the node run in."""
         return get_ident() == self.thread
 
-    def check_thread(self, path: str) -> None:
-        """Refuse a call from another thread.
+    def is_other_loop(self) -> bool:
+        """Whether another loop runs in this thread now than the one that the actors of the node run in."""
+        return running_loop() is not self.loop and running_loop() is not None and not self.loop.is_running()
+
+    def check_caller(self, path: str) -> None:
+        """Refuse a call from another thread, or from another loop of this one.
 
         Raises:
-            WrongThread: naming the actor that was called.
+            WrongThread, WrongLoop: naming the actor that was called.
         """
         if get_ident() != self.thread:
             raise WrongThread(path, threading.current_thread().name)
+        if self.is_other_loop():
+            raise WrongLoop(path)
 
     def run_now(self) -> None:
         """Run what is ready at once instead of in the next tick: for callbacks of the loop that bring messages."""

@@ -81,13 +81,13 @@ def admit_gone(cell: Cell, item: Any) -> None:
     elif isinstance(item, Item):
         item.undelivered(cell, _gone_at(cell))
     else:
-        cell.node.dead_letter(cell, item, SYSTEM_ENDED if _is_over(cell.node) else "the actor has stopped")
+        cell.node.dead_letter(cell, item, SYSTEM_ENDED if is_over(cell.node) else "the actor has stopped")
 
 
 SYSTEM_ENDED = "the system has ended"
 
 
-def _is_over(node: Node) -> bool:
+def is_over(node: Node) -> bool:
     """Whether the whole system has ended, so that nobody will live at any address of it."""
     return node.root is not None and node.root.is_dead
 
@@ -95,7 +95,7 @@ def _is_over(node: Node) -> bool:
 def _gone_at(cell: Cell) -> str:
     """Why nobody is at an address."""
     root = cell.node.root
-    if _is_over(cell.node):
+    if is_over(cell.node):
         return SYSTEM_ENDED
     if root is None or cell.parent is not None or cell.path.split("/")[1:2] == root.path.split("/")[1:2]:
         return "nobody lives at its address now"

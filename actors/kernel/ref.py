@@ -59,8 +59,9 @@ class ActorRef(Addressed, Generic[A_co]):
             MailboxFull: the mailbox is bounded and refuses. Who cannot be told, because the mailbox is in another
                 process, or the sender a recorded turn whose sends leave later, has a dead letter made of the message.
             BadMessage: the message cannot be coded and has to be.
-            WrongThread: the system runs in another thread, and this call would have to wake it; see
-                `ActorSystem.from_thread`. (While it is awake a call from another thread may pass unnoticed.)
+            WrongThread, WrongLoop: the system runs in another thread, or in another loop of this one, and this call
+                would have to wake it; see `ActorSystem.from_thread`. (While it is awake a tell from elsewhere to a task
+                without recovery may pass unnoticed.)
         """
         cell = self._cell
         sender = current.get(None)
@@ -74,14 +75,14 @@ class ActorRef(Addressed, Generic[A_co]):
 
         Raises:
             ActorStopped: the address has ended for good.
-            UnknownMessage, MailboxFull, BadMessage: as `tell`.
+            UnknownMessage, MailboxFull, BadMessage: as `tell`. WrongThread, WrongLoop: the system runs elsewhere.
         """
         cell = self._cell
         sender = current.get(None)
         if sender is not None:
             await sender._send(cell, message)
             return
-        cell.node.check_thread(cell.path)
+        cell.node.check_caller(cell.path)
         while (room := cell.room()) is not None:
             await room
         if type(message) not in cell.table:
@@ -111,7 +112,8 @@ class ActorRef(Addressed, Generic[A_co]):
             A future of the reply. Cancelling it ends the wait, never the turn.
 
         Raises:
-            SpecError: the time-out is no such number. UnknownMessage, BadMessage, WrongThread: as `tell`.
+            SpecError: the time-out is no such number. UnknownMessage, BadMessage: as `tell`. WrongThread, WrongLoop:
+                the system runs elsewhere.
 
         Raises (by the awaitable):
             Refusal: the handler's typed "no".
@@ -126,7 +128,7 @@ class ActorRef(Addressed, Generic[A_co]):
         if type(message) not in cell.table:
             cell.require(message)
         node = cell.node
-        node.check_thread(cell.path)
+        node.check_caller(cell.path)
         future: asyncio.Future[R] = node.loop.create_future()
         ask = Ask(message, None, (), timeout, NO_DEADLINE, future, cell)
         node.deadlines.add(ask)
@@ -163,7 +165,7 @@ class ActorRef(Addressed, Generic[A_co]):
         if caller is not None:
             caller._order(cell, order)
             return
-        cell.node.check_thread(cell.path)
+        cell.node.check_caller(cell.path)
         cell.obey(order, "")
 
     def __repr__(self) -> str:

@@ -156,7 +156,7 @@ def admit_remote(cell: Cell, item: Any) -> None:
     if type(item) not in cell.table and type(item) is not Parcel:
         _require(cell, item)
     outlet: Outlet = cell.more.outlet  # type: ignore[union-attr]  # made before this function stands there
-    cell.node.check_thread(outlet.path)
+    cell.node.check_caller(outlet.path)
     if outlet.worker is None:
         _check_codable(cell, item)
         mailbox.queue_of(cell).append(item)
@@ -169,7 +169,7 @@ def admit_remote_bounded(cell: Cell, item: Any) -> None:
     if type(item) not in cell.table and type(item) is not Parcel:
         _require(cell, item)
     more = cell.extra()
-    cell.node.check_thread(cell.path)
+    cell.node.check_caller(cell.path)
     _check_codable(cell, item)
     assert more.bound is not None
     more.bound.admit(cell, item)

@@ -343,7 +343,7 @@ def admit_unread(cell: Cell, item: Any) -> None:
     Raises:
         HoldfastError: it cannot be, and the item is no ask, which fails for that reason.
     """
-    cell.node.check_thread(cell.path)
+    cell.node.check_caller(cell.path)
     home = cast("RecordedHome", cell.host.home)
     try:
         home.take_in(cell)

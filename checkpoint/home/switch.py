@@ -22,6 +22,7 @@ from ...actors.exit_reasons import crash
 from ...actors.kernel.cell import Cell
 from ...actors.kernel.codec import Parcel
 from ...actors.kernel.envelope import Ask, Chain, Item, waiters
+from ...actors.kernel.loop import running_loop
 from ...actors.kernel.message import message_name
 from ...actors.kernel.node import cell_kind
 from ..durable_links import DurableTies
@@ -155,8 +156,8 @@ class Switch:
     def admit(self, cell: Cell, item: Any) -> None:
         """Stands in `cell.admit`: number, journal, and feed unless the actor is being recovered."""
         node = self.node
-        if get_ident() != node.thread:
-            node.check_thread(self.path)
+        if get_ident() != node.thread or running_loop() is not node.loop:
+            node.check_caller(self.path)
         message, sender = item, None
         ask: Any = None
         chain: Chain = ()

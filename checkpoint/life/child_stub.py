@@ -191,7 +191,9 @@ class ChildPlace(Place):
         kind, topics = message_name(start.kind), list(start.kind._topics)
         bindings = {name: target.path for name, target in cell.extra().bindings.items()}
         spec, bound = cell.spec, self.home.bound
-        port.to_home(Wanted(self._number, kind, topics, method, bound, made, bindings, spec.register, spec.made_up))
+        wanted = Wanted(self._number, kind, topics, method, bound, made, bindings, spec.register, spec.made_up)
+        wanted.comes_back = spec.comes_back
+        port.to_home(wanted)
         return self._up
 
     def is_starting(self, number: int) -> bool:

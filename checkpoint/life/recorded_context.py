@@ -407,7 +407,7 @@ class RecordedContext(ActorContext):
             self._outside()
             super()._order(cell, order)
         else:
-            cell.node.check_thread(cell.path)
+            cell.node.check_caller(cell.path)
             if not own:
                 cell.require_order(order)
                 note_order(self._cell, cell)

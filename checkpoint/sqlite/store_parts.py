@@ -286,7 +286,7 @@ class Parts:
                 continue
             if identity is not None and own == identity.id:
                 continue
-            known = "no identity" if own is None else f"the identity {own}"
+            known = "no identity" if own is None else f"the identity {own!r}"
             wanted = "none" if identity is None else identity.id
             raise self.refused(
                 folder,

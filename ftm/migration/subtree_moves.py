@@ -131,7 +131,8 @@ def to_process_below(parent: FarParent, spec: ChildSpec, method: Method) -> Addr
     made = AtRoot(pack_recipe(spec.start, parent.path), [], limits_data(spec.limits))
     topics = list(spec.start.kind._topics)
     parent.prepare(made, topics)
-    wanted = Wanted(parent.number, message_name(spec.start.kind), topics, method, None, made)
+    kind, back = message_name(spec.start.kind), spec.comes_back
+    wanted = Wanted(parent.number, kind, topics, method, None, made, comes_back=back)
     return process_below(parent, wanted, None)
 
 
@@ -267,7 +268,8 @@ class FromSubtree(Leaving):
         luggage.waiting, self._held = [*unpack(self._worker, cell, told["waiting"]), *self._held], []
         self._keep_watches([(str(path), bool(for_good)) for path, for_good in told["watches"]])
         kind = self._spec.start.kind
-        wanted = Wanted(NUMBER, message_name(kind), list(kind._topics), UNKEPT, chosen)
+        topics, back = list(kind._topics), self._spec.comes_back
+        wanted = Wanted(NUMBER, message_name(kind), topics, UNKEPT, chosen, comes_back=back)
         self._parent.comes_to_root(cell, wanted)
         more.start = self._spec.start
         return [*take_orders(self._worker, cell)]

@@ -1467,6 +1467,13 @@ CHECKS = {
         "tests/checkpoint/sqlite/test_cuts.py",
         "test_a_failed_sync_of_the_rows",
     ),
+    "what a damaged identity holds is shown as text": Check(
+        "checkpoint/sqlite/store_parts.py",
+        "the identity {own!r}",
+        "the identity {own}",
+        "tests/checkpoint/sqlite/test_parts.py",
+        "test_what_a_damaged_file_holds_is_shown",
+    ),
     "the lock on a store outlives a look from its owner's process": Check(
         "checkpoint/sqlite/store_parts.py",
         "            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)\n",

@@ -38,6 +38,7 @@ CHANGES = "tests/effects/test_changes_of_races.py"
 ORDERS = "tests/effects/test_orders_while_resting.py"
 RESTING = "tests/effects/test_moves_while_resting.py"
 CIRCLES = "tests/actors/test_circles.py"
+THREADS = "tests/system/test_threads.py"
 LINKS = "tests/actors/test_links.py"
 TURNS = "tests/supervision/test_turn_timeout.py"
 EFFECTS = "tests/effects/test_effect_processes.py"
@@ -60,6 +61,48 @@ SETTERS = "tests/checkpoint/test_own_setters.py"
 DECLARED = "tests/supervision/test_declared_classes.py"
 
 CHECKS = {
+    "who is away with its supervisor in a process is no error": Check(
+        "checkpoint/protocol.py",
+        "    comes_back: bool = True\n",
+        "",
+        TEXTS,
+        "test_who_is_away_with_its_supervisor",
+    ),
+    "when the system has ended nobody is restarted": Check(
+        "actors/kernel/lifecycle.py",
+        "return parent_ended(cell) and not mailbox.is_over(cell.node)",
+        "return parent_ended(cell)",
+        TEXTS,
+        "test_who_is_away_with_its_supervisor",
+    ),
+    "who asks from another loop is refused while the system has something to do": Check(
+        "actors/kernel/loop.py",
+        "        if self.is_other_loop():\n            raise WrongLoop(path)\n",
+        "",
+        THREADS,
+        "something_to_do and task",
+    ),
+    "who tells a recorded actor from another loop is refused": Check(
+        "checkpoint/home/switch.py",
+        "if get_ident() != node.thread or running_loop() is not node.loop:",
+        "if get_ident() != node.thread:",
+        THREADS,
+        "something_to_do and durable",
+    ),
+    "a system is not used from another loop": Check(
+        "system/system.py",
+        "        if self._running.is_other_loop():\n",
+        "        if False:\n",
+        THREADS,
+        "something_to_do and task",
+    ),
+    "a system is not ended from another loop": Check(
+        "system/system.py",
+        "        node.check_caller(root.path)\n",
+        "",
+        THREADS,
+        "something_to_do and task",
+    ),
     "what a system lacks before it is entered says so": Check(
         "system/system.py",
         "            if name in MADE_WITH_NODE:\n",
@@ -384,8 +427,8 @@ CHECKS = {
     ),
     "another event loop of the thread is refused": Check(
         "actors/kernel/loop.py",
-        "        if not self.loop.is_running() and running_loop() is not None:\n",
-        "        if False:\n",
+        "        if not self.is_own_thread() or self.is_other_loop():\n",
+        "        if not self.is_own_thread():\n",
         "tests/system/test_threads.py",
         "another_event_loop_of_the_thread and tell",
     ),

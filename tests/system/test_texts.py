@@ -96,3 +96,33 @@ async def test_who_could_not_be_started_is_named_once(kind: Any, isolation: Any,
         with pytest.raises(hf.StartFailed) as caught:
             await system.start(hf.child("one", hf.start(kind), isolation=isolation, recovery=recovery))
         assert str(caught.value) == "/app/one could not be started: key 'k' is held"
+
+
+PLACES: dict[str, dict[str, Any]] = {
+    "task": {},
+    "recorded": {"recovery": hf.hybrid()},
+    "process": {"isolation": "process"},
+    "recorded process": {"recovery": hf.hybrid(), "isolation": "process"},
+}
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+@pytest.mark.parametrize("place", PLACES)
+async def test_who_is_away_with_its_supervisor_or_the_system_is_said_to_be(place: str, isolation: Any) -> None:
+    """Each call says the same of it, wherever it lived."""
+
+    async def said() -> set[str]:
+        calls = [system.get_state, system.outline, system.get_status, system.suspend, system.terminate]
+        outcomes = await asyncio.gather(*(call(ref) for call in calls), return_exceptions=True)
+        return {f"{type(one).__name__}: {one}" for one in outcomes}
+
+    counter = hf.child("counter", hf.start(Idle), **PLACES[place])
+    stopped = "ActorStopped: /app/below/counter has stopped ({}); the message was not handled"
+    async with hf.ActorSystem("app", log=False) as system:
+        below = await system.start(hf.supervisor("below", children=[counter], isolation=isolation))
+        ref = system.ref("/app/below/counter", Idle)
+        await system.stop(below)
+        assert await said() == {stopped.format("its supervisor has ended, and may start it again")}
+    assert await said() == {stopped.format("the system has ended")}
+    with pytest.raises(hf.ActorStopped):
+        await ref.ask(Count(), restarting="fail")

@@ -7,6 +7,7 @@ import concurrent.futures
 import functools
 import threading
 from collections.abc import AsyncIterator, Callable, Coroutine
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -306,4 +307,43 @@ def test_another_event_loop_of_the_thread_is_told_so(call: str) -> None:
         assert first.run(here()) == []  # Nothing of it has come.
         book.tell(Note(2, 2))  # While no loop runs, it is as in a callback of its own.
         assert first.run(here()) == [(2, 2)]
+        first.run(system.shutdown())
+
+
+@pytest.mark.parametrize("way", [*WAYS, "durable"])
+def test_another_event_loop_is_told_so_while_the_system_has_something_to_do(way: str, tmp_path: Path) -> None:
+    """Nothing comes of a call, wherever the actor lives, and the system goes on."""
+    options, store = (WAYS["recorded"], f"sqlite:{tmp_path}/app.db") if way == "durable" else (WAYS[way], None)
+    with asyncio.Runner() as first, asyncio.Runner() as second:
+        system = hf.ActorSystem("app", store=store, log=False)
+        first.run(system.open())
+        book = first.run(system.start(hf.child("book", hf.start(Notebook), **options)))
+        another = hf.child("another", hf.start(Notebook))
+        calls: dict[str, Callable[[], Any]] = {
+            "ask": lambda: book.ask(Noted()),
+            "send": lambda: book.send(Note(7, 7)),
+            "stop": book.stop,
+            "kill": book.kill,
+            "start": lambda: system.start(another),
+            "get_state": lambda: system.get_state(book),
+            "suspend": lambda: system.suspend(book),
+            "stop for good": lambda: system.stop(book),
+            "publish": lambda: system.publish("/notes", Note(7, 7)),
+            "shutdown": system.shutdown,
+        }
+        if way not in ("task", "bounded"):  # While such a task has something to do, it gets what it is told.
+            calls["tell"] = lambda: book.tell(Note(7, 7))
+
+        async def called(call: Callable[[], Any]) -> None:
+            with pytest.raises(hf.errors.WrongLoop, match="/app"):
+                await call()
+
+        async def noted() -> list[tuple[int, int]]:
+            return await book.ask(Noted())
+
+        book.tell(Note(1, 1))  # Neither loop runs: it is to be handled when the first one does.
+        for call in calls.values():
+            second.run(called(call))
+        assert first.run(noted()) == [(1, 1)]
+        first.run(system.start(another))  # It was not started before.
         first.run(system.shutdown())

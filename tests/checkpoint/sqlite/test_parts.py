@@ -232,6 +232,15 @@ def test_a_store_of_before_gets_an_identity_and_what_was_begun_of_that_is_finish
     assert reopened(path).snapshot == LARGE  # The folder is empty: it can be nobody else's.
 
 
+def test_what_a_damaged_file_holds_is_shown_as_text_in_one_line(tmp_path: Path) -> None:
+    path = filled(tmp_path / "app.db")
+    Path(f"{path}-snapshots", "store-id").write_bytes(b"holdfast-store \x1b[2J\n\rall is well")
+    with pytest.raises(ForeignStore) as caught:
+        SqliteJournal(path)
+    assert str(caught.value).isprintable()
+    assert r"\x1b[2J\n" in str(caught.value)
+
+
 def test_a_maker_that_was_killed_leaves_nothing_in_the_way(tmp_path: Path) -> None:
     path = tmp_path / "app.db"
     filled(path)
