@@ -2058,6 +2058,13 @@ CHECKS = {
         WRONG,
         "test_a_hook_cannot_say",
     ),
+    "an order that cannot be sent to another process is no trouble of whoever hands it on": Check(
+        "actors/control/orders_lane.py",
+        "        call.ask.fail(error)\n        return\n    if isinstance(call.ask, OrderAsk):\n",
+        "        raise\n    if isinstance(call.ask, OrderAsk):\n",
+        AT_ODDS,
+        "test_an_order_that_cannot_be_sent and lodging",
+    ),
 }
 
 test_the_table_is_true, test_without_the_check_a_test_fails = as_tests(CHECKS)
