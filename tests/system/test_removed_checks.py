@@ -2065,6 +2065,20 @@ CHECKS = {
         AT_ODDS,
         "test_an_order_that_cannot_be_sent and lodging",
     ),
+    "what is sent to an address whose process has ended goes to who lives there now": Check(
+        "actors/kernel/address_host.py",
+        "            return there.host.offer(there, item)\n",
+        "            return self.home.offer(cell, item)\n",
+        "tests/actors/process/test_subtree.py",
+        "test_a_ref_from_before",
+    ),
+    "a subscriber whose process dies is no trouble of the publisher": Check(
+        "actors/kernel/topics.py",
+        "    AskFailed,  # Its process has ended, which was to say that it has the message.\n",
+        "",
+        "tests/actors/process/test_subtree.py",
+        "test_a_subscriber_whose_process_dies",
+    ),
 }
 
 test_the_table_is_true, test_without_the_check_a_test_fails = as_tests(CHECKS)
