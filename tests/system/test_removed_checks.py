@@ -2086,6 +2086,13 @@ CHECKS = {
         ORDERS,
         "test_an_order_that_waits_for_a_change_of_place",
     ),
+    "who is cancelled while it is asked what was waited for leaves nobody at rest": Check(
+        "system/transaction/transaction.py",
+        "            finally:  # Also for whoever is cancelled while it is asked what was waited for.\n",
+        "            except ZeroDivisionError:\n                raise\n            else:\n",
+        COMMIT,
+        "test_who_is_cancelled_while",
+    ),
 }
 
 test_the_table_is_true, test_without_the_check_a_test_fails = as_tests(CHECKS)
