@@ -205,28 +205,6 @@ def the_same(state: dict[str, Any]) -> dict[str, Any]:
     return state
 
 
-async def test_an_order_that_waits_for_a_change_of_place_obeys_the_new_one(tmp_path: Path) -> None:
-    """Its turn was to be left where it is not any more."""
-    async with running(tmp_path) as system:
-        ref = await system.start(patient())
-        asked = ref.ask(Go(["c"]), IN_TIME)
-        await waits(system)
-
-        async def protect() -> None:
-            async with system.transaction(timeout=IN_TIME) as change:
-                change.protect(ref, hf.ftm.PBR())
-
-        protected = asyncio.ensure_future(protect())
-        async with asyncio.timeout(IN_TIME):
-            while not any("/ftm/" in path for path in system.tree()):
-                await asyncio.sleep(0.001)
-        with pytest.raises(hf.ControlFailed, match="it is protected"):
-            await system.replace_state(ref, the_same, timeout=IN_TIME)
-        await protected
-        await ref.ask(Call("a"), IN_TIME)
-        assert await asked == "call a"
-
-
 @pytest.mark.parametrize("isolation", ["task", "process"])
 async def test_what_the_turn_had_changed_so_far_is_not_kept(tmp_path: Path, isolation: Any) -> None:
     async with running(tmp_path, "os") as system:

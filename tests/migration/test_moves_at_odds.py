@@ -100,7 +100,7 @@ async def test_a_move_waits_for_another_one_no_longer_than_its_time_limit(
 async def test_an_order_that_cannot_be_sent_to_the_new_place_fails_alone(
     system: hf.ActorSystem, kind: str, about: str, tmp_path: Path
 ) -> None:
-    """It was given where it could be carried out, and comes out of the queue where it cannot: no trouble of the move."""
+    """It was given where it could be carried out, and comes out of the queue where it cannot."""
     ref = await supervised(system, child(hf.start(Reluctant, str(tmp_path / "no")), kind))
     assert await ref.ask(Add(1), IN_TIME) == 1
     (tmp_path / "no").touch()

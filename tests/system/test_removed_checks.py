@@ -2079,13 +2079,6 @@ CHECKS = {
         "tests/actors/process/test_subtree.py",
         "test_a_subscriber_whose_process_dies",
     ),
-    "a turn is left where it rests when it is the order's turn": Check(
-        "system/live_moves.py",
-        "        if not rests(cell):\n            return\n        spec = _spec_of(cell)\n",
-        "        spec = _spec_of(cell)\n",
-        ORDERS,
-        "test_an_order_that_waits_for_a_change_of_place",
-    ),
     "who is cancelled while it is asked what was waited for leaves nobody at rest": Check(
         "system/transaction/transaction.py",
         "            finally:  # Also for whoever is cancelled while it is asked what was waited for.\n",
