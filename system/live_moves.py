@@ -316,8 +316,11 @@ class Moves:
     async def _renewed(self, cell: Cell, timeout: float, gate: CommitGate) -> None:
         """Have the life at an address, a turn of which rests, begin anew where it is, before that turn.
 
-        Not if the gate is closed meanwhile: its turn has ended by itself.
+        Not if the gate is closed meanwhile: its turn has ended by itself. And not where the change before, for which
+        this one has waited, has left the turn, or has given the actor a place in which it is not left so.
         """
+        if not rests(cell):
+            return
         spec = _spec_of(cell)
         await self._moved(cell, timeout, lambda: self._made(cell, spec, timeout), lambda: None, gate)
 

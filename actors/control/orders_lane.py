@@ -150,11 +150,11 @@ def order(cell: Cell, wanted: Order, timeout: float) -> asyncio.Future[Any]:
 
     Raises (by the future):
         ActorStopped: nobody lives there. AskTimeout: it was not carried out in time (`handled` False), or nobody
-        knows. AskFailed: the actor's process ended meanwhile. ControlFailed: it could not be carried out.
+        knows. AskFailed: the actor's process ended meanwhile. ControlFailed: it could not be carried out. SpecError:
+        the actor lives in another process, and the order cannot be sent there.
 
     Raises (at once):
-        SpecError: `timeout` is no finite number of seconds > 0, or the actor lives in another process, and the order
-        cannot be sent there.
+        SpecError: `timeout` is no finite number of seconds > 0.
     """
     node = cell.node
     future: asyncio.Future[Any] = node.loop.create_future()
@@ -164,21 +164,21 @@ def order(cell: Cell, wanted: Order, timeout: float) -> asyncio.Future[Any]:
         return future
     ask = OrderAsk(ORDERED, None, (), timeout, NO_DEADLINE, future, living)
     node.deadlines.add(ask)
-    try:
-        living.host.control(living, QueuedOrder(ask, wanted))
-    except BaseException:
-        future.cancel()
-        raise
+    living.host.control(living, QueuedOrder(ask, wanted))
     return future
 
 
 def send_call(peer: Peer, path: str, call: QueuedOrder) -> None:
     """Give the order to the actor at `path` on the other side of a connection.
 
-    Raises:
-        SpecError: it cannot be sent.
+    One that cannot be sent there fails. Nothing is raised: it may come out of a queue, in the middle of a move or of a
+    start that has nothing to do with it.
     """
-    data = encode_value(call.order.pack(path), where=f"{call.order.verb} of {path}")
+    try:
+        data = encode_value(call.order.pack(path), where=f"{call.order.verb} of {path}")
+    except HoldfastError as error:
+        call.ask.fail(error)
+        return
     if isinstance(call.ask, OrderAsk):
         call.ask.call = call
     _send(peer, path, call.ask, call.order.verb, data)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from ..errors import StartFailed
 from ..events import ActorKilled
-from .cell import RUNNING, TurnRest
+from .cell import GONE, RUNNING, TurnRest
 from .envelope import Ask, Item
 
 if TYPE_CHECKING:
@@ -335,7 +335,13 @@ class AddressHost:
         self.home.push(cell, item)
 
     def offer(self, cell: Cell, item: Any) -> Awaitable[None] | None:
-        return self.home.offer(cell, item)
+        if cell.state is not GONE:
+            return self.home.offer(cell, item)
+        there = cell.node.successor(cell)
+        if there is not None:
+            return there.host.offer(there, item)
+        cell.admit(cell, item)  # The home may be in a process that has ended: nobody would answer.
+        return None
 
     def backlog(self, cell: Cell) -> int:
         return self.home.backlog(cell, self.place.running(cell))

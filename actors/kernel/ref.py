@@ -75,6 +75,7 @@ class ActorRef(Addressed, Generic[A_co]):
 
         Raises:
             ActorStopped: the address has ended for good.
+            AskFailed: the process of its supervisor has ended, and nobody knows whether the message was accepted there.
             UnknownMessage, MailboxFull, BadMessage: as `tell`. WrongThread, WrongLoop: the system runs elsewhere.
         """
         cell = self._cell

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import (
     ActorStopped,
+    AskFailed,
     ConnectionFull,
     ConnectionLost,
     MailboxFull,
@@ -22,7 +23,16 @@ if TYPE_CHECKING:
     from .message import Message
     from .node import Node
 
-NOT_TAKEN = (ActorStopped, ConnectionFull, ConnectionLost, MailboxFull, StoreError, UnknownMessage, Unreachable)
+NOT_TAKEN = (
+    ActorStopped,
+    AskFailed,  # Its process has ended, which was to say that it has the message.
+    ConnectionFull,
+    ConnectionLost,
+    MailboxFull,
+    StoreError,
+    UnknownMessage,
+    Unreachable,
+)
 """Why one subscriber may not take what is published; the others get it all the same."""
 
 

@@ -264,9 +264,12 @@ class Worker(Peer):
             self._watch.beat()
 
     def gone(self) -> asyncio.Future[None]:
-        """A future that ends when the process is dead, reaped and told of; it is killed now if it was not."""
+        """A future that ends when the process is dead, reaped and told of; it is killed now if it was not.
+
+        Each caller has one of its own: who gives up waiting ends nobody else's.
+        """
         self.kill(KILLED)
-        return self._grave
+        return asyncio.shield(self._grave)
 
     # -- what it says -----------------------------------------------------------------------------------------------
 
@@ -400,8 +403,7 @@ class Worker(Peer):
         self.page.release()
         self.forked.close()
         self._workers.buried(self)
-        if not self._grave.done():
-            self._grave.set_result(None)
+        self._grave.set_result(None)
 
 
 def _seen(done: asyncio.Future[Any]) -> None:

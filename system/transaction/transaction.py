@@ -161,15 +161,16 @@ class Transaction:
             system._homes.journal.barrier()
             self._commit()  # In the same step of the loop in which all were ready.
         except BaseException as error:
-            if isinstance(error, TimeoutError):
-                waits = "; ".join(filter(None, (waiting, "" if at is None else at.waits_for)))
-                waits = waits or ("" if at is None else await system._turn_in_hand(at.target, is_left=True))
-                cause = f"not within {self._timeout:g} s{f': {waits}' if waits else ''}"
-            else:
-                cause = said(error)
             failed = failed or self._arrangement.step
-            undone, kept = await self._release(begun)
-            self._emit(TransactionRolledBack(self._address, self._texts, failed, cause, kept))
+            cause = f"not within {self._timeout:g} s" if isinstance(error, TimeoutError) else said(error)
+            try:
+                if isinstance(error, TimeoutError):
+                    waits = "; ".join(filter(None, (waiting, "" if at is None else at.waits_for)))
+                    waits = waits or ("" if at is None else await system._turn_in_hand(at.target, is_left=True))
+                    cause += f": {waits}" if waits else ""
+            finally:  # Also for whoever is cancelled while it is asked what was waited for.
+                undone, kept = await self._release(begun)
+                self._emit(TransactionRolledBack(self._address, self._texts, failed, cause, kept))
             if isinstance(error, (HoldfastError, TimeoutError)):
                 raise TransactionFailed(failed, cause, undone, kept) from error
             raise

@@ -1150,6 +1150,13 @@ CHECKS = {
         FAILOVER,
         "test_a_message_that_kills",
     ),
+    "who gives up waiting for the end of a process ends nobody else's wait": Check(
+        "actors/process/worker_pool.py",
+        "        return asyncio.shield(self._grave)\n",
+        "        return self._grave\n",
+        "tests/ftm/test_adaptation_trouble.py",
+        "test_who_gives_up_as_the_replica",
+    ),
 }
 
 test_the_table_is_true, test_without_the_check_a_test_fails = as_tests(CHECKS)

@@ -95,6 +95,33 @@ async def test_a_move_waits_for_another_one_no_longer_than_its_time_limit(
     assert system.pid_of(ref) != os.getpid()
 
 
+@pytest.mark.parametrize("about", ["isolation", "lodging"])
+@pytest.mark.parametrize("kind", list(KINDS))
+async def test_an_order_that_cannot_be_sent_to_the_new_place_fails_alone(
+    system: hf.ActorSystem, kind: str, about: str, tmp_path: Path
+) -> None:
+    """It was given where it could be carried out, and comes out of the queue where it cannot."""
+    ref = await supervised(system, child(hf.start(Reluctant, str(tmp_path / "no")), kind))
+    assert await ref.ask(Add(1), IN_TIME) == 1
+    (tmp_path / "no").touch()
+
+    async def move() -> None:
+        async with system.transaction(timeout=IN_TIME) as change:
+            CHANGES[about](change, ref)
+
+    moved = asyncio.ensure_future(move())
+    await exists(f"{tmp_path}/no.met")  # It is at rest: what is ordered waits.
+    replaced = asyncio.ensure_future(system.replace_state(ref, lambda state: state, timeout=IN_TIME))
+    await asyncio.wait((replaced,), timeout=0.1)
+    assert not replaced.done()
+    (tmp_path / "no").unlink()
+    with pytest.raises(hf.SpecError, match="replace_state needs a function of a module"):
+        await replaced
+    await moved
+    assert await ref.ask(Add(1), IN_TIME) == 2
+    assert system.pid_of(ref) != os.getpid()
+
+
 class Die(hf.Message): ...
 
 

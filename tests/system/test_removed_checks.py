@@ -2101,6 +2101,34 @@ CHECKS = {
         WRONG,
         "test_a_hook_cannot_say",
     ),
+    "an order that cannot be sent to another process is no trouble of whoever hands it on": Check(
+        "actors/control/orders_lane.py",
+        "        call.ask.fail(error)\n        return\n    if isinstance(call.ask, OrderAsk):\n",
+        "        raise\n    if isinstance(call.ask, OrderAsk):\n",
+        AT_ODDS,
+        "test_an_order_that_cannot_be_sent and lodging",
+    ),
+    "what is sent to an address whose process has ended goes to who lives there now": Check(
+        "actors/kernel/address_host.py",
+        "            return there.host.offer(there, item)\n",
+        "            return self.home.offer(cell, item)\n",
+        "tests/actors/process/test_subtree.py",
+        "test_a_ref_from_before",
+    ),
+    "a subscriber whose process dies is no trouble of the publisher": Check(
+        "actors/kernel/topics.py",
+        "    AskFailed,  # Its process has ended, which was to say that it has the message.\n",
+        "",
+        "tests/actors/process/test_subtree.py",
+        "test_a_subscriber_whose_process_dies",
+    ),
+    "who is cancelled while it is asked what was waited for leaves nobody at rest": Check(
+        "system/transaction/transaction.py",
+        "            finally:  # Also for whoever is cancelled while it is asked what was waited for.\n",
+        "            except ZeroDivisionError:\n                raise\n            else:\n",
+        COMMIT,
+        "test_who_is_cancelled_while",
+    ),
 }
 
 test_the_table_is_true, test_without_the_check_a_test_fails = as_tests(CHECKS)

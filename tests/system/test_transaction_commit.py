@@ -803,6 +803,55 @@ async def test_a_process_that_dies_at_the_commit_loses_nothing_of_it(system: hf.
     assert told.problems == ()
 
 
+class Late(hf.system.Operation):
+    """A step that is never ready, and says when the time is up."""
+
+    verb = "wait for"
+
+    def __init__(self, target: str) -> None:
+        super().__init__(target)
+        self.is_up = asyncio.Event()
+        self.is_released = False
+
+    async def check(self, system: hf.ActorSystem, draft: Any) -> None: ...
+
+    @property
+    def waits_for(self) -> str:
+        self.is_up.set()
+        return ""
+
+    async def prepare(self, system: hf.ActorSystem) -> None:
+        await asyncio.Event().wait()
+
+    async def release(self, system: hf.ActorSystem) -> None:
+        self.is_released = True
+
+
+async def test_who_is_cancelled_while_it_is_asked_what_was_waited_for_leaves_nothing_prepared(
+    system: hf.ActorSystem,
+) -> None:
+    a = await system.start(hf.child("a", hf.start(Counter), recovery=hf.hybrid(), isolation="process"))
+    step = Late("/app/a")
+    pid = system.pid_of(a)
+
+    async def change() -> None:
+        async with system.transaction(timeout=0.1) as change:
+            change.step(step)
+
+    changed = asyncio.ensure_future(change())
+    await asyncio.wait((changed,), timeout=0.01)
+    os.kill(pid, signal.SIGSTOP)  # It does not say what it does.
+    try:
+        await step.is_up.wait()
+        changed.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await changed
+    finally:
+        os.kill(pid, signal.SIGCONT)
+    assert step.is_released
+    assert await a.ask(Add(1), IN_TIME) == 1
+
+
 # -- the root ends ----------------------------------------------------------------------------------------------------
 
 

@@ -13,7 +13,7 @@ import holdfast as hf
 from holdfast.actors.events import ChildRestarted, ProcessDied, SupervisorGaveUp
 from holdfast.supervision.admin import WhichChildren
 from tests.actors.process.observers import AskPort, Heard, HeardSome, Observer, Publish, Send, Watch
-from tests.actors.process.players import Account, Add, Fail, Introduce, Note, Notebook, Notes, Picky, Total, Where
+from tests.actors.process.players import Account, Add, Fail, Introduce, Note, Notebook, Notes, Picky, Seen, Total, Where
 from tests.actors.process.waiting import next_event, until
 
 
@@ -117,6 +117,37 @@ async def test_death_of_the_process_ends_what_was_asked_inside(system: hf.ActorS
     with pytest.raises(hf.AskFailed, match="SIGKILL"):
         await never
     assert await watcher.ask(HeardSome(2)) == [["down", "/app/team/book", "SIGKILL", "False"]] * 2
+
+
+async def test_a_ref_from_before_its_process_died_sends_to_who_lives_there_now(system: hf.ActorSystem) -> None:
+    team = await system.start(subtree(intensity=100))
+    other = await system.start(hf.child("other", hf.start(Observer), isolation="process"))
+    book = system.ref("/app/team/book", Observer)
+    await book.send(Note("before"))
+    os.kill(system.pid_of(team), signal.SIGKILL)
+    await team.ask(WhichChildren())
+    await until(lambda: "/app/team/book" in system.tree())
+    async with asyncio.timeout(30.0):
+        await book.send(Note("from outside"))
+        assert await other.ask(Send(book, 1)) == "1 sent"
+    assert await book.ask(Notes()) == ["from outside", "0"]
+    await system.stop(team)
+    with pytest.raises(hf.ActorStopped):
+        await book.send(Note("to nobody"))
+
+
+async def test_a_subscriber_whose_process_dies_is_no_trouble_of_the_publisher_and_the_others(
+    system: hf.ActorSystem,
+) -> None:
+    team = await system.start(subtree())
+    here = await system.start(hf.child("here", hf.start(Notebook)))
+    pid = system.pid_of(team)
+    os.kill(pid, signal.SIGSTOP)  # It takes what is published, and does not say so.
+    published = asyncio.ensure_future(system.publish("/news", Seen("extra")))
+    await asyncio.wait((published,), timeout=0.05)
+    os.kill(pid, signal.SIGKILL)
+    await published
+    assert await here.ask(Notes()) == ["extra"]
 
 
 async def test_strategies_hold_inside(system: hf.ActorSystem) -> None:
