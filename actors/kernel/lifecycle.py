@@ -311,6 +311,18 @@ class Stop(Item):
         return LEAVE
 
 
+class CutOff(Stop):
+    """A command: end behind a turn that was left in the middle, without `on_stop`."""
+
+    __slots__ = ()
+    ends_turn = True
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        finish(actor.ctx._cell, item.reason, is_orderly=False)
+        return LEAVE
+
+
 class Kill(Item):
     """A command: end now, without hooks."""
 

@@ -198,8 +198,8 @@ class RunLoop:
         runner = self._idle.pop() if self._idle else Runner(self)
         while runner.task.cancelling():  # Cancelled while it was idle: that cancel is for none of our turns.
             runner = self._idle.pop() if self._idle else Runner(self)
-        self.entered = runner
         _enter_task(self.loop, runner.task)
+        self.entered = runner
 
     def _leave(self) -> None:
         """Give the runner back to the idle ones."""

@@ -478,8 +478,13 @@ class Life:
 
     def _leave(self, turn: Suspended, reason: ExitReason) -> None:
         self.feed, self.outs = None, []  # What its handler says while it is cancelled does not count.
-        turn.then = functools.partial(lifecycle.finish, self.cell, reason, is_orderly=False)
+        turn.then = functools.partial(self._end_left, reason)
         turn.runner.task.cancel()
+
+    def _end_left(self, reason: ExitReason) -> None:
+        """The turn is left. What follows is a step of its own: it may wait for children, and has another runner."""
+        mailbox.queue_of(self.cell).appendleft(lifecycle.CutOff(reason))
+        self.cell.node.make_ready(self.cell)
 
     def leave_turn(self) -> bool:
         """Leave the turn in hand for the next life, which runs it again from its start; False if it does not rest."""

@@ -2287,6 +2287,13 @@ CHECKS = {
         "tests/supervision/test_ignore.py",
         "test_a_first_start_that_is_refused and raise",
     ),
+    "what follows a turn that was left is a step of its own": Check(
+        "checkpoint/life/recorded_life.py",
+        "        mailbox.queue_of(self.cell).appendleft(lifecycle.CutOff(reason))\n        self.cell.node.make_ready(self.cell)\n",
+        "        lifecycle.finish(self.cell, reason, is_orderly=False)\n",
+        "tests/effects/test_orders_while_resting.py",
+        "who_has_children_is_stopped and task",
+    ),
 }
 
 test_the_table_is_true, test_without_the_check_a_test_fails = as_tests(CHECKS)

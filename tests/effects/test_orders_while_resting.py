@@ -311,3 +311,51 @@ async def test_what_helps_where_a_turn_is_not_left_is_said_and_helps(tmp_path: P
         assert system.pid_of(ref) != os.getpid()
         await ref.ask(Call("a"), IN_TIME)
         assert await asked == "newer: call a"
+
+
+class Parent(Patient):
+    """Has a child, which ends before it does."""
+
+    def on_start(self, restored: bool) -> None:
+        self.ctx.spawn(hf.start(Idle), "child")
+
+
+class Idle(hf.Actor): ...
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_who_has_children_is_stopped_while_its_turn_rests(tmp_path: Path, isolation: Any) -> None:
+    """It waits for them in a step of its own. In that of the turn that is left no actor of the loop had another one."""
+    async with running(tmp_path) as system:
+        other = await system.start(hf.child("other", hf.start(Patient), recovery=hf.hybrid()))
+        spec = hf.child("patient", hf.start(Parent), recovery=hf.hybrid(), isolation=isolation, restart="temporary")
+        ref = await system.start(spec)
+        asked = asyncio.ensure_future(ref.ask(Go(["c"]), IN_TIME))
+        await waits(system)
+        async with asyncio.timeout(IN_TIME):
+            await system.stop(ref)
+        with pytest.raises(hf.HoldfastError):
+            await asked
+        assert await other.ask(Count(), IN_TIME) == 1
+
+
+async def test_an_order_that_waits_for_a_change_of_place_obeys_the_new_one(tmp_path: Path) -> None:
+    """Its turn was to be left where it is not any more."""
+    async with running(tmp_path) as system:
+        ref = await system.start(patient())
+        asked = ref.ask(Go(["c"]), IN_TIME)
+        await waits(system)
+
+        async def protect() -> None:
+            async with system.transaction(timeout=IN_TIME) as change:
+                change.protect(ref, hf.ftm.PBR())
+
+        protected = asyncio.ensure_future(protect())
+        async with asyncio.timeout(IN_TIME):
+            while not any("/ftm/" in path for path in system.tree()):
+                await asyncio.sleep(0.001)
+        with pytest.raises(hf.errors.ControlFailed, match="it is protected"):
+            await system.replace_state(ref, the_same, timeout=IN_TIME)
+        await protected
+        await ref.ask(Call("a"), IN_TIME)
+        assert await asked == "call a"

@@ -2129,6 +2129,13 @@ CHECKS = {
         COMMIT,
         "test_who_is_cancelled_while",
     ),
+    "who was left by another change is not left again": Check(
+        "system/live_moves.py",
+        "        if not rests(cell):\n",
+        "        if False:\n",
+        "tests/effects/test_orders_while_resting.py",
+        "an_order_that_waits_for_a_change_of_place",
+    ),
 }
 
 test_the_table_is_true, test_without_the_check_a_test_fails = as_tests(CHECKS)
