@@ -2289,7 +2289,8 @@ CHECKS = {
     ),
     "what follows a turn that was left is a step of its own": Check(
         "checkpoint/life/recorded_life.py",
-        "        mailbox.queue_of(self.cell).appendleft(lifecycle.CutOff(reason))\n        self.cell.node.make_ready(self.cell)\n",
+        "        mailbox.queue_of(self.cell).appendleft(lifecycle.CutOff(reason))\n"
+        "        self.cell.node.make_ready(self.cell)\n",
         "        lifecycle.finish(self.cell, reason, is_orderly=False)\n",
         "tests/effects/test_orders_while_resting.py",
         "who_has_children_is_stopped and task",
