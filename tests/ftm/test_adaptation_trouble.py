@@ -10,7 +10,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import psutil
 import pytest
 
 import holdfast as hf
@@ -119,38 +118,6 @@ async def test_who_wants_it_is_cancelled_at_each_step(system: hf.ActorSystem, st
     await load.reached(10)
     await load.stop()
     load.check(await ref.ask(Tags()))
-
-
-async def test_who_gives_up_as_the_replica_that_tries_is_being_ended_ends_nobody_elses_wait(
-    system: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Its death is waited for once more by what takes the change back."""
-    ref = await protected(system)
-    change = asyncio.ensure_future(transition(system, ref, LFR()))
-    server = psutil.Process(pid_of(system, ref, "r1")).parent()
-    assert server is not None
-    kill, tried = Replicas.kill, list[str]()
-
-    async def cancelled_meanwhile(replicas: Replicas, name: str, life: int) -> None:
-        tried.append(name)
-        if len(tried) == 1:
-            change.cancel()
-            server.suspend()  # Nobody is reaped until both wait for it.
-        waiting = asyncio.ensure_future(kill(replicas, name, life))
-        await asyncio.wait((waiting,), timeout=0)
-        if len(tried) > 1:
-            server.resume()
-        await waiting
-
-    monkeypatch.setattr(Replicas, "kill", cancelled_meanwhile)
-    with system.events() as events:
-        with pytest.raises(asyncio.CancelledError):
-            await change
-        async with system.transaction():  # It begins when the other one is over.
-            pass
-        assert tried == ["trial", "trial"]
-        assert not [event for event in events.take() if isinstance(event, hf.events.ActorCrashed)]
-    assert await consistent(system, ref) == ("pbr",)
 
 
 async def test_a_replica_that_cannot_prepare_it_leaves_all_as_it_was(system: hf.ActorSystem, tmp_path: Path) -> None:

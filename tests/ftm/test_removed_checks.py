@@ -1154,8 +1154,8 @@ CHECKS = {
         "actors/process/worker_pool.py",
         "        return asyncio.shield(self._grave)\n",
         "        return self._grave\n",
-        "tests/ftm/test_adaptation_trouble.py",
-        "test_who_gives_up_as_the_replica",
+        "tests/actors/process/test_process_actor.py",
+        "test_who_gives_up_waiting_for_the_end_of_a_process",
     ),
 }
 

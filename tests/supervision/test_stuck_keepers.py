@@ -7,6 +7,7 @@ import os
 import signal
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
@@ -127,12 +128,15 @@ async def test_its_descendants_end_with_it(system: hf.ActorSystem, ends: Ends, f
 
 
 @pytest.mark.parametrize("fate", [stop, hang])
-async def test_one_whose_keeper_is_stuck_while_it_starts_it(system: hf.ActorSystem, fate: Fate) -> None:
-    starting = asyncio.create_task(system.start(python(BEATS, ready="up")))
+async def test_one_whose_keeper_is_stuck_while_it_starts_it(system: hf.ActorSystem, fate: Fate, tmp_path: Path) -> None:
+    let = tmp_path / "let"  # It is not up before its keeper is stuck.
+    waits = f"import os, time\nwhile not os.path.exists({str(let)!r}):\n    time.sleep(0.01)\n"
+    starting = asyncio.create_task(system.start(python(waits + BEATS, ready="up")))
     await until(lambda: len(own_children()) == 1)
     fate(own_children()[0].pid)
     begin = time.monotonic()
     if fate is stop:
+        let.touch()
         await starting
     else:
         with pytest.raises(hf.StartFailed, match="its keeper ended with code -9"):

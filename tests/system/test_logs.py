@@ -148,8 +148,8 @@ async def test_a_recorded_actor_that_crashes_as_it_starts_has_its_traceback_told
     async with hf.ActorSystem() as system:
         with pytest.raises(hf.StartFailed):
             await system.start(hf.child("stillborn", hf.start(Stillborn), recovery=hf.hybrid()))
-    assert [record["event"] for record in records] == ["recovery failed", "child not started"]
-    assert ["exception" in record for record in records] == [False, True]
+    assert [record["event"] for record in records] == ["child not started"]
+    assert "exception" in records[0]
 
 
 @pytest.mark.parametrize("log_payloads", [False, True])

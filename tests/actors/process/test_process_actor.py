@@ -459,3 +459,13 @@ async def test_a_kill_while_it_starts_leaves_no_process(system: hf.ActorSystem) 
         assert await worker.ask(Add(1)) == 1
     await system.stop(worker)
     assert system._workers.processes() == {}
+
+
+async def test_who_gives_up_waiting_for_the_end_of_a_process_ends_nobody_elses_wait(system: hf.ActorSystem) -> None:
+    await start(system, hf.start(Multiplier))
+    [worker] = system._workers.by_cell.values()
+    first, second = worker.gone(), worker.gone()
+    first.cancel()
+    async with asyncio.timeout(30.0):
+        await second
+    assert not second.cancelled()
