@@ -105,6 +105,7 @@ def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("small_chunks")
 @pytest.mark.parametrize("seed", range(SEEDS))
+@pytest.mark.some(3)
 def test_whatever_is_done_to_it_comes_back_with_all_that_is_shared(images: Images, seed: int) -> None:
     print(f"seed {seed}")
     dice = random.Random(seed)

@@ -83,6 +83,7 @@ async def test_what_little_has_changed_is_written_and_all_comes_back(
 
 
 @pytest.mark.parametrize("where", ["task", "process"])
+@pytest.mark.some(2)
 async def test_a_life_ends_in_the_middle_of_a_snapshot(store: str | None, where: str) -> None:
     print(f"seed {SEED}")
     dice, want = random.Random(SEED), Book(MANY)

@@ -139,6 +139,7 @@ async def test_who_has_given_up_before_the_turn_begins_is_not_served(
 
 @pytest.mark.parametrize("where", ["task", "process"])
 @pytest.mark.parametrize("name", ["hybrid", "replay_only"])
+@pytest.mark.some(2)
 async def test_a_turn_that_has_begun_in_time_is_finished_in_the_next_life(
     system: hf.ActorSystem, name: str, where: str
 ) -> None:

@@ -66,6 +66,7 @@ async def total(ring: list[hf.ActorRef[Any]], moves: int) -> int:
             await asyncio.sleep(0.01)
 
 
+@pytest.mark.some(3)
 async def test_no_sum_is_lost_or_doubled_whenever_the_cut_is_made(isolation: str, store: str | None) -> None:
     moments = random.Random(SEED)
     async with running(store) as system:

@@ -89,6 +89,7 @@ def memory_files(pid: int | str = "self") -> list[str]:
 
 @pytest.mark.pairs
 @pytest.mark.parametrize("cells", [CELLS, MANY])
+@pytest.mark.some(3)
 async def test_what_a_life_does_to_its_state_does_not_reach_its_snapshot(
     store: str | None, isolation: str, cells: int
 ) -> None:
@@ -105,6 +106,7 @@ async def test_what_a_life_does_to_its_state_does_not_reach_its_snapshot(
 
 
 @pytest.mark.parametrize("where", ["task", *REMOTE])
+@pytest.mark.some(3)
 async def test_what_comes_back_unchanged_is_not_written_again(store: str | None, where: str) -> None:
     want = model(MANY)
     async with hf.ActorSystem("app", store=store, log=False, intensity=1000) as system:
@@ -157,6 +159,7 @@ async def test_two_come_back_at_once(store: str | None) -> None:
 
 
 @pytest.mark.parametrize("where", REMOTE)
+@pytest.mark.some(2)
 async def test_a_life_that_is_killed_while_it_comes_back_is_followed_by_another(store: str | None, where: str) -> None:
     moments = random.Random(SEED)
     print(f"seed {SEED}")

@@ -399,6 +399,7 @@ def test_random_messages_snapshots_and_crashes(name: str, actions: list[tuple[st
 # -- what goes back with the state of a snapshot ----------------------------------------------------------------------
 
 
+@pytest.mark.some(3)
 async def test_timers_and_subscriptions_go_back_with_the_state(isolation: str, store: str | None) -> None:
     """One that was cancelled since comes back, one that was started since does not."""
     async with hf.ActorSystem("app", log=False, intensity=1000, store=store) as system:

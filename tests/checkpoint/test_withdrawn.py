@@ -49,6 +49,7 @@ async def told_of(ref: hf.ActorRef[Slow], *names: str) -> list[bool | None]:
 @pytest.mark.parametrize("where", WHERE)
 @pytest.mark.parametrize("kept", STORES)
 @pytest.mark.parametrize("way", ["behind a turn", "suspended"])
+@pytest.mark.some(5)
 async def test_what_waits_until_its_time_is_over_is_never_handled(
     tmp_path: Path, name: str, where: str, kept: str, way: str
 ) -> None:
@@ -83,6 +84,7 @@ async def test_nor_behind_a_mechanism(tmp_path: Path, stack: str) -> None:
 
 @pytest.mark.parametrize("name", METHODS)
 @pytest.mark.parametrize("where", WHERE)
+@pytest.mark.some(5)
 async def test_of_the_turn_in_hand_nobody_knows(tmp_path: Path, name: str, where: str) -> None:
     async with system_for("os", tmp_path) as system:
         ref = await begun(system, tmp_path, where, method=METHODS[name])

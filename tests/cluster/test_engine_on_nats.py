@@ -28,6 +28,7 @@ SEEDS = 2
 
 
 @pytest.mark.parametrize("promise", PROMISES, ids=lambda promise: promise.__name__)
+@pytest.mark.some(3)
 async def test_a_real_server_keeps_it(nats1: NatsServers, promise: Callable[[Connect], Awaitable[None]]) -> None:
     access = nats1.access(nats1.new_system())
     opened: list[Engine] = []

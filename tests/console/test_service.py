@@ -287,6 +287,7 @@ async def test_it_ends_when_its_main_returns(project: Path) -> None:
         ("tree:hf", "it must be a spec"),
     ],
 )
+@pytest.mark.some(3)
 async def test_what_cannot_be_run_is_said(project: Path, target: str, problem: str) -> None:
     status, _, errors = await holdfast("run", target)
     assert (status, problem in errors, "Traceback" in errors) == (UNUSABLE, True, False)

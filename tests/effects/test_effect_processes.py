@@ -90,6 +90,7 @@ def runner(isolation: Any = "task", **options: Any) -> hf.ChildSpec[Runner]:
 
 @pytest.mark.parametrize("isolation", ["task", "process"])
 @pytest.mark.parametrize("method", [hf.hybrid(interval=1000.0), hf.fresh()], ids=["hybrid", "fresh"])
+@pytest.mark.some(2)
 async def test_what_comes_of_it_is_its_outcome(tmp_path: Path, isolation: str, method: Any) -> None:
     world = str(tmp_path / "world")
     async with hf.ActorSystem("app", log=False, intensity=99) as system:
@@ -128,6 +129,7 @@ async def test_a_time_limit_ends_it(tmp_path: Path, isolation: str) -> None:
 
 @pytest.mark.parametrize("end", ["actor", "root"])
 @pytest.mark.parametrize("isolation", ["task", "process"])
+@pytest.mark.some(2)
 async def test_it_ends_with_whoever_waits_for_it(tmp_path: Path, isolation: str, end: str) -> None:
     """Also if it computes, and the program is killed."""
     world = str(tmp_path / "world")

@@ -250,6 +250,7 @@ async def test_whoever_leads_next_waits_for_it_or_has_it(tmp_path: Path, name: s
 
 @pytest.mark.parametrize("name", ["lfr", "pbr", "lfr + tr"])
 @pytest.mark.parametrize("step", ["protocol", "proceed"])
+@pytest.mark.some(3)
 async def test_what_was_taken_is_handled_by_nobody_if_the_leader_dies_with_that_news(name: str, step: str) -> None:
     """The follower was given it in the same batch, and hears when it leads that its turn has it already."""
     with injecting() as page:

@@ -257,6 +257,7 @@ STACKS: dict[str, Any] = {"tr": TR(detection=None), "pbr": PBR(), "lfr": LFR(), 
 @pytest.mark.parametrize(
     ("stack", "how"), [("tr", "sleep"), ("tr", "wait"), ("pbr", "sleep"), ("lfr", "wait"), ("tmr", "effect")]
 )
+@pytest.mark.some(3)
 async def test_who_is_protected_is_moved_when_its_turn_is_over(tmp_path: Path, stack: str, how: str) -> None:
     world = str(tmp_path / "world")
     async with hf.ActorSystem("app", log=False, intensity=99) as system:

@@ -64,6 +64,7 @@ asyncio.run(house(*sys.argv[1:]))
 
 
 @pytest.mark.parametrize("step", STEPS)
+@pytest.mark.some(4)
 def test_no_bid_is_lost_or_doubled_by_a_kill_of_the_program(tmp_path: Path, step: str) -> None:
     block = re.search(r"```python\n(.*?)async def house", PAGE.read_text(), re.DOTALL)
     assert block is not None

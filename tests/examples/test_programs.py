@@ -76,6 +76,7 @@ async def test_killed_twice_it_ends_as_if_it_had_not_been(case: Case) -> None:
 
 @each_program
 @pytest.mark.asyncio(loop_factories=["uvloop"])
+@pytest.mark.some(3)
 async def test_killed_without_recovery_it_fails(case: Case) -> None:
     killed = await run(case.load_or_skip(), hf.fresh(), kill_at=case.kills[:1])
     assert not killed.recoveries

@@ -51,6 +51,7 @@ def recovery(request: pytest.FixtureRequest) -> Any:
 
 
 @pytest.mark.parametrize("isolation", ["task", "process"])
+@pytest.mark.some(4)
 async def test_attached_and_detached_under_load_nothing_is_lost(
     system: hf.ActorSystem, recovery: Any, isolation: Any
 ) -> None:
@@ -298,6 +299,7 @@ async def test_its_next_lives_are_protected_too_and_not_after_a_detach(system: h
     assert not isinstance(ref._cell.host.place, GroupPlace)
 
 
+@pytest.mark.some(2)
 async def test_timers_come_along(system: hf.ActorSystem, recovery: Any) -> None:
     ref = await system.start(hf.child("alice", hf.start(Counter), recovery=recovery))
     await ref.ask(Later(1.0, 1))

@@ -185,6 +185,7 @@ async def test_the_bindings_of_the_bricks_are_seen_from_outside(system: hf.Actor
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("who", ["primary", "backup"])
+@pytest.mark.some(4)
 async def test_killing_a_replica_under_load_loses_nothing(system: hf.ActorSystem, method: str, who: str) -> None:
     ref = await started(system, recovery=METHODS[method]())
     load, rng = Load(ref), random.Random(f"{SEED} {method} {who}")

@@ -65,6 +65,7 @@ def test_a_drop_in_bandwidth_leads_from_pbr_to_lfr() -> None:
 
 
 @pytest.mark.parametrize("state", [1_000, 20_000, 1_000_000, 100_000_000])
+@pytest.mark.some(2)
 def test_bandwidth_that_returns_leads_back_from_lfr_to_pbr(state: int) -> None:
     """A22, A21: with the settings that nobody has touched."""
     app = msgspec.structs.replace(APP, state_bytes=state)

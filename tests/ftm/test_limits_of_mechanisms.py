@@ -146,6 +146,7 @@ class Hotel(hf.Actor):
     [(hf.ftm.PBR(), []), (hf.ftm.TMR(), []), (hf.ftm.LFR(), ["late"]), (hf.ftm.TR(), ["late"])],
     ids=["pbr", "tmr", "lfr", "tr"],
 )
+@pytest.mark.some(2)
 async def test_behind_lfr_and_tr_an_ask_that_was_put_aside_is_handled_when_its_time_is_over(
     system: hf.ActorSystem, mechanism: Any, served: list[str]
 ) -> None:

@@ -19,6 +19,7 @@ BACK_WITHIN = 1.0
 
 @pytest.mark.parametrize("every", [0.6, 1.3, 3.0])
 @pytest.mark.parametrize("mechanism", [PBR(), LFR()], ids=["pbr", "lfr"])
+@pytest.mark.some(3)
 def test_a_replica_that_is_lost_at_a_steady_rate_is_back_within_a_second(mechanism: Any, every: float) -> None:
     @simulate(seed=7, intensity=10_000)
     async def losses(system: GuardedSystem, simulation: Simulation) -> None:

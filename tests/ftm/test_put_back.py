@@ -230,6 +230,7 @@ async def test_whoever_leads_dies_while_what_was_put_back_is_handled(
 
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("mechanism", MECHANISMS)
+@pytest.mark.some(6)
 async def test_all_that_have_the_state_die_and_what_was_put_back_is_replayed_for_both_of_its_turns(
     system: hf.ActorSystem, mechanism: str, seed: int
 ) -> None:
@@ -453,6 +454,7 @@ async def test_what_is_put_back_by_blocks_and_votes_is_handled_as_without_faults
 
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("mechanism", DECIDING)
+@pytest.mark.some(6)
 async def test_what_is_put_back_by_blocks_and_votes_is_replayed_as_it_was(
     system: hf.ActorSystem, mechanism: str, seed: int
 ) -> None:

@@ -67,6 +67,7 @@ async def test_what_waits_behind_a_turn_that_blocks_was_not_handled(
 
 
 @pytest.mark.parametrize("place", sorted(PLACES))
+@pytest.mark.some(2)
 async def test_what_has_begun_may_have_been_handled(system: hf.ActorSystem, place: str, tmp_path: Path) -> None:
     ref = await system.start(hf.child("slow", hf.start(Slow), **PLACES[place]))
     held = ref.ask(Hold(str(tmp_path / "go")), timeout=2.0)

@@ -360,6 +360,7 @@ async def test_a_turn_that_waits(system: hf.ActorSystem) -> None:
 
 @pytest.mark.parametrize("places", [("task", "process"), ("process", "task"), ("process", "process")], ids="-".join)
 @pytest.mark.parametrize("recovery", [None, hf.hybrid()], ids=["none", "hybrid"])
+@pytest.mark.some(3)
 async def test_a_turn_that_waits_wherever_both_live(
     system: hf.ActorSystem, places: tuple[Any, Any], recovery: hf.Method | None
 ) -> None:

@@ -390,6 +390,7 @@ async def test_its_next_life_has_all_children_and_so_has_that_of_its_own_supervi
 
 
 @pytest.mark.parametrize("way", list(WAYS))
+@pytest.mark.some(3)
 async def test_whom_it_is_asked_to_start_meanwhile_is_there_if_it_says_so(system: hf.ActorSystem, way: str) -> None:
     old, new = WAYS[way]
     await plant(system, old, spec_for(way, "plain", "task"), old, new)

@@ -202,6 +202,7 @@ def hang(ref: hf.ActorRef[Any], file: Path, *, fails: bool) -> hf.system.Operati
 
 @pytest.mark.parametrize("fails", [False, True], ids=["committed", "given up"])
 @pytest.mark.parametrize("kind", list(KINDS))
+@pytest.mark.some(3)
 async def test_the_process_that_it_is_lent_keeps_a_transaction_no_longer_than_its_time_limit(
     system: hf.ActorSystem, kind: str, fails: bool, tmp_path: Path
 ) -> None:

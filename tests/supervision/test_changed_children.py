@@ -202,6 +202,7 @@ async def test_a_transaction_changes_flags_and_leaves_the_template(tmp_path: Pat
 @pytest.mark.parametrize(
     ("kind", "place"), [("template", "task"), ("spec", "task"), ("plain", "task"), ("plain", "process")]
 )
+@pytest.mark.some(2)
 async def test_a_mechanism_is_that_of_one_child(tmp_path: Path, kind: str, place: Isolation) -> None:
     """It has it each time it is started, in this program and the next ones; another child of its name has none."""
     member = player.member("gone")

@@ -108,6 +108,7 @@ async def test_when_their_supervisor_is_restarted(kind: str, file: str) -> None:
 
 @pytest.mark.parametrize("end", ["stop", "kill"])
 @pytest.mark.parametrize("by", ["nobody", "tell", "ask"])
+@pytest.mark.some(3)
 async def test_what_they_are_told_meanwhile_is_kept(by: str, end: str, tmp_path: Path, file: str) -> None:
     store = f"sqlite:{tmp_path}/store"
     async with program(store) as system:

@@ -61,6 +61,7 @@ def held_by(change: Any, what: str, held: hf.ActorRef[Any]) -> None:
         ("protect", "process", False),
     ],
 )
+@pytest.mark.some(2)
 async def test_who_is_at_rest_goes_on_while_another_one_is_restarted(
     system: hf.ActorSystem, what: str, isolation: Any, fails: bool
 ) -> None:

@@ -760,6 +760,7 @@ if __name__ == "__main__":
 
 @pytest.mark.parametrize("how", list(DECLARED))
 @pytest.mark.parametrize("when", ["prepare", "commit", "finish"])
+@pytest.mark.some(5)
 async def test_a_root_that_is_killed_has_it_at_one_of_the_two(tmp_path: Path, when: str, how: str) -> None:
     (tmp_path / "program.py").write_text(PROGRAM)
     await kills_itself(

@@ -147,6 +147,7 @@ if __name__ == "__main__":
 @pytest.mark.parametrize(
     ("how", "beside"), [("signal", ""), ("signal", "beside"), ("return", ""), ("return", "beside"), ("asyncio", "")]
 )
+@pytest.mark.some(3)
 def test_what_swallows_its_cancellation_keeps_no_program_alive(how: str, beside: str, tmp_path: Path) -> None:
     script = tmp_path / "program.py"
     script.write_text(STUBBORN, "utf-8")

@@ -126,6 +126,7 @@ def test_all_damages_are_told_each_with_its_place_and_what_to_do(tmp_path: Path)
 
 @pytest.mark.parametrize("part", ["app.db", "app.db-snapshots", "app.db-packs"])
 @pytest.mark.parametrize("seed", range(SEED, SEED + 2))
+@pytest.mark.some(3)
 def test_whatever_a_recovery_would_miss_is_found(tmp_path: Path, part: str, seed: int) -> None:
     """Flip random bits: what is said to be good is read as before."""
     draw = random.Random(f"{seed} {part}")

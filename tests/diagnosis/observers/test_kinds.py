@@ -127,6 +127,7 @@ async def until(watching: diagnosis.Watch, component: str, state: State) -> Diag
 
 
 @pytest.mark.parametrize(("place", "kind"), CASES, ids=lambda case: case)
+@pytest.mark.some(3)
 async def test_it_is_seen_to_work_and_to_hang(place: str, kind: str) -> None:
     component = PATHS[place].removeprefix("/t/")
     async with hf.ActorSystem("t", log=False) as system:
