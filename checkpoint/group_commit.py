@@ -24,6 +24,7 @@ from ..actors.events import Event, JournalBlocked, JournalGoesOn, JournalStopped
 from .commit_lanes import CommitLanes, Submission
 from .journal import Entry, InHand, MemoryJournal, Saved, StaleEpoch, StoreEngine, StoreFailed
 from .method import Durability
+from .protocol import STEPS
 
 if TYPE_CHECKING:
     from .snapshot.shared_blocks import Segment
@@ -33,8 +34,6 @@ RETRY_SECONDS = 0.05
 MOST_RETRY_SECONDS = 1.0
 MOST = 250
 """Messages written and let out in one go, or their ends: about 2 ms of the loop's time."""
-STEPS = 4
-"""Steps of the loop for which what a turn has heard waits for what the turn says next: both are one append then."""
 PATIENCE_SECONDS = 0.05
 """How long the message handler may take to come, before the homes do its work themselves."""
 
@@ -135,7 +134,8 @@ class Commits:
     def submit(self, submission: Submission, *, is_patient: bool = False) -> None:
         """Take in what has happened: it is written at the end of this tick, or when the store has room again.
 
-        If it `is_patient`, nothing waits for it itself: it is written with what is submitted next, or `STEPS` later.
+        If it `is_patient`, nothing waits for it itself: it is written with what its turn says next, as one
+        append, or when that has had its `STEPS`.
         """
         if self.stopped is not None:  # It never leaves: what is open now is taken up again when the store is.
             submission.abandoned(self.stopped)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import sys
 import zlib
 from collections.abc import Iterator
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any, Final, TypeAlias
 
 import msgspec
 
@@ -100,6 +100,11 @@ class Came(Answer, array_like=True, gc=False):
 
     nth: int = 0
     after: int = 0
+
+
+STEPS: Final = 4
+"""Steps of the event loop in which a handler acts on an outcome. `asyncio.wait` and `asyncio.gather` take two, and an
+`asyncio.shield`, a task or a further `gather` around what was awaited takes one more, or two."""
 
 
 def came(answer: Answer, nth: int = 0, after: int = 0) -> Came:

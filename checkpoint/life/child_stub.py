@@ -190,10 +190,11 @@ class ChildPlace(Place):
         port = self.join(cell)
         kind, topics = message_name(start.kind), list(start.kind._topics)
         bindings = {name: target.path for name, target in cell.extra().bindings.items()}
-        spec, bound = cell.spec, self.home.bound
-        wanted = Wanted(self._number, kind, topics, method, bound, made, bindings, spec.register, spec.made_up)
-        wanted.comes_back = spec.comes_back
-        port.to_home(wanted)
+        spec, bound, back = cell.spec, self.home.bound, cell.spec.comes_back
+        register, made_up = spec.register, spec.made_up
+        port.to_home(
+            Wanted(self._number, kind, topics, method, bound, made, bindings, register, made_up, comes_back=back)
+        )
         return self._up
 
     def is_starting(self, number: int) -> bool:

@@ -13,16 +13,13 @@ from typing import TYPE_CHECKING, Final
 
 from ...actors.kernel.cell import RUNNING
 from ...actors.kernel.loop import TurnRemains
-from ..protocol import GIVEN_UP, MESSAGE, GivenUp, Outcome, untimed
+from ..protocol import GIVEN_UP, MESSAGE, STEPS, GivenUp, Outcome, untimed
 from .recorded_context import Resting
 
 if TYPE_CHECKING:
     from ...actors.kernel.cell import Cell
     from .recorded_life import Life
 
-STEPS: Final = 4
-"""Steps of the event loop in which a handler acts on an outcome. `asyncio.wait` and `asyncio.gather` take two, and an
-`asyncio.shield`, a task or a further `gather` around what was awaited takes one more, or two."""
 PATIENCE: Final = 5.0
 """Seconds after which an outcome is told all the same: the handler has gone another way, as a comparison will show."""
 

@@ -48,6 +48,7 @@ from ..protocol import (
     REPLY,
     START,
     STASHED,
+    STEPS,
     TICK,
     Answer,
     Feed,
@@ -81,7 +82,7 @@ from ..turn_word import OVER, TurnWord
 from .determinism_guard import DeterminismGuard
 from .glances import answer_beside
 from .life_state import Asked, Awaited, LifeStage, LifeTimers, LifeWaits, RestoredState, SnapshotState
-from .outcome_order import STEPS, OutcomeOrder, is_given_up
+from .outcome_order import OutcomeOrder, is_given_up
 from .readonly_guard import check_readonly
 from .recorded_context import Pending, RecordedContext, RecordedReplyHandle
 from .recorded_inbox import INIT, STOP, Fed, GoLive, Hook, StopRecorded, TakeSnapshot

@@ -10,6 +10,9 @@ import msgspec
 import pytest
 
 import holdfast as hf
+from holdfast.actors.kernel.codec import Packed
+from holdfast.actors.process.wire import start_codec
+from holdfast.actors.values import encode_value
 from tests.supervision.family import Boom, Family, Leave, Life, Plan, kid, refused
 
 virtual = pytest.mark.asyncio(loop_factories=["virtual"])
@@ -497,6 +500,25 @@ async def test_arguments_of_a_start_that_cannot_be_sent_are_refused_where_they_a
         ):
             await pool.ask(hf.StartChild(args=([1, object()],)))
         assert await pool.ask(hf.WhichChildren()) == []
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        start_codec._Packed(5, (), {}),  # type: ignore[arg-type]  # as a process may say that is not ours any more
+        start_codec._PackedSuccessor(5, ()),  # type: ignore[arg-type]
+        start_codec._Packed(f"{__name__}:Nobody", (), {}),
+        start_codec._PackedData("subprocess:Popen", {"args": "ls"}),
+    ],
+    ids=["no class", "no start", "nobody", "a class of its choice"],
+)
+async def test_arguments_from_a_process_that_lies_are_refused_and_end_nobody(given: object) -> None:
+    async with hf.ActorSystem(log=False) as system:
+        pool = await system.start(hf.dynamic("pool", template=hf.child(None, hf.start(Given))))
+        error = await refused(pool.ask(hf.StartChild(args=(Packed(encode_value(given)),))))
+        assert isinstance(error, hf.SpecError)
+        assert "an argument cannot be read here" in str(error)
+        assert (await system.get_status(pool)).life == 1
 
 
 BEGUN: list[int] = []

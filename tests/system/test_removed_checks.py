@@ -2136,6 +2136,13 @@ CHECKS = {
         "tests/effects/test_orders_while_resting.py",
         "an_order_that_waits_for_a_change_of_place",
     ),
+    "an argument that is none ends no supervisor": Check(
+        "actors/process/wire/start_codec.py",
+        "    except (AttributeError, TypeError, RecursionError) as error:",
+        "    except ZeroDivisionError as error:",
+        "tests/supervision/test_dynamic.py",
+        "test_arguments_from_a_process_that_lies",
+    ),
 }
 
 test_the_table_is_true, test_without_the_check_a_test_fails = as_tests(CHECKS)

@@ -10,10 +10,10 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any, ClassVar, TypeVar
 
-from ...errors import SpecError, type_name
+from ...errors import SpecError, error_text, type_name
 from ...kernel.actor import Actor, Start
 from ...kernel.message import message_name
-from ...values import decode_value, encode_value, state_digest
+from ...values import SavedRef, decode_value, encode_value, state_digest
 
 T = TypeVar("T")
 
@@ -96,7 +96,7 @@ def unpack_data(data: bytes) -> Any:
     Raises:
         SpecError: a class cannot be found. DamagedValue: these are no such bytes.
     """
-    return _raise_up(decode_value(data))
+    return _read(data)
 
 
 def pack_argument(value: object, where: str) -> bytes:
@@ -114,7 +114,7 @@ def unpack_argument(data: bytes, refs: Callable[[str], object], *, imports: bool
     Raises:
         SpecError, DamagedValue: as `unpack_data`.
     """
-    return _raise_up(decode_value(data, imports=imports, refs=refs), imports=imports)
+    return _read(data, refs, imports=imports)
 
 
 def unpack_told(data: bytes, kind: type[T]) -> T:
@@ -123,10 +123,7 @@ def unpack_told(data: bytes, kind: type[T]) -> T:
     Raises:
         SpecError: it is none, or names what is not loaded here. DamagedValue: these are no such bytes.
     """
-    try:
-        value = _raise_up(decode_value(data, imports=False), imports=False, told=kind)
-    except TypeError as error:  # Fields that there are not.
-        raise SpecError("recipe", f"the data is no {kind.__name__}: {error}") from error
+    value = _read(data, imports=False, told=kind)
     if not isinstance(value, kind):
         raise SpecError("recipe", f"the data is no {kind.__name__}")
     return value
@@ -138,10 +135,24 @@ def unpack_recipe(data: bytes, *, imports: bool = True) -> Start[Any]:
     Raises:
         SpecError: the class cannot be found, or is no actor.
     """
-    start = _raise_up(decode_value(data, imports=imports), imports=imports)
+    start = _read(data, imports=imports)
     if not isinstance(start, Start):
         raise SpecError("recipe", "the data is no actor recipe")
     return start
+
+
+def _read(
+    data: bytes, refs: Callable[[str], object] = SavedRef, *, imports: bool = True, told: type | None = None
+) -> Any:
+    """The value, whoever has made its bytes.
+
+    Raises:
+        SpecError: what stands for a recipe in it is none. DamagedValue: these are no such bytes.
+    """
+    try:
+        return _raise_up(decode_value(data, imports=imports, refs=refs), imports=imports, told=told)
+    except (AttributeError, TypeError, RecursionError) as error:  # No such fields, or others in them; or it is endless.
+        raise SpecError("recipe", f"the data is none: {error_text(error)}") from error
 
 
 def _lower(value: Any, where: str) -> Any:
