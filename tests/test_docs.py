@@ -106,13 +106,19 @@ def marking(text: str, folder: Path) -> str:
     for line, row, column in error_branches(text):
         mark = f"__import__('pathlib').Path({str(folder / str(line))!r}).touch(); "
         lines[row] = lines[row][:column] + mark + lines[row][column:]
+    assert not lines[0], "a block begins behind the first line of its document"
+    lines[0] = "__import__('warnings').simplefilter('error')"
     return "\n".join(lines) + "\n"
 
 
 def run(path: Path) -> tuple[int, str]:
-    """Run a script in a session of its own, killed at the time limit, and return its exit code and output."""
+    """Run a script in a session of its own, killed at the time limit, and return its exit code and output.
+
+    With `HOLDFAST_COLD` warnings are errors in the processes that it starts, too.
+    """
+    options = ["-W", "error"] if "HOLDFAST_COLD" in os.environ else []
     with subprocess.Popen(
-        [sys.executable, "-W", "error", str(path)],
+        [sys.executable, *options, str(path)],
         cwd=path.parent,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
@@ -167,6 +173,7 @@ def test_quotations(document: Path) -> None:
         assert quoted in (ROOT / path).read_text("utf-8"), f"line {block.line}: this does not stand in {path}"
 
 
+@pytest.mark.usefixtures("warm_programs")
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_blocks_run(document: Path, tmp_path: Path) -> None:
     text = program(list(python_blocks(document.read_text("utf-8"))))
@@ -205,12 +212,10 @@ def test_blocks_keep_their_lines() -> None:
 
 
 def test_an_error_that_is_not_met_is_noticed(tmp_path: Path) -> None:
-    text = (
-        "try:\n    raise hf.SendError\nexcept hf.SendError as é:\n    x = 'é'; y = x\nexcept hf.AskFailed:\n    pass\n"
-    )
-    assert [branch.line for branch in error_branches(text)] == [3, 5]
+    text = "\ntry:\n    raise hf.SendError\nexcept hf.SendError as é:\n    x = 'é'; y = x\nexcept hf.Hung:\n    pass\n"
+    assert [branch.line for branch in error_branches(text)] == [4, 6]
     exec(compile(marking(text, tmp_path), "script", "exec"), {"hf": holdfast})
-    assert [one.name for one in tmp_path.iterdir()] == ["3"]
+    assert [one.name for one in tmp_path.iterdir()] == ["4"]
 
 
 @pytest.mark.parametrize("language", ["py", "python3", "pycon", "python no-run"])
