@@ -18,6 +18,7 @@ Run as a program, this is the warm process.
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import ctypes
 import importlib
@@ -35,11 +36,13 @@ import sys
 import threading
 import time
 import traceback
+from asyncio.base_subprocess import BaseSubprocessTransport
 from collections.abc import Callable, Generator
 from types import ModuleType
 from typing import Any, NoReturn
 
 import psutil
+import uvloop
 
 MODULES = (
     "holdfast.system.worker_main", "holdfast.actors.process.fork.zygote", "holdfast.ftm.replica.replica",
@@ -255,11 +258,44 @@ def warm_popen(warm: WarmServers) -> Generator[None]:
         names = ("p2cread", "p2cwrite", "c2pread", "c2pwrite", "errread", "errwrite")
         popen._close_pipe_fds(*(given[name] for name in names))
 
+    by_libuv = uvloop.Loop.subprocess_exec
     subprocess.Popen._execute_child = start  # type: ignore[attr-defined]
+    setattr(uvloop.Loop, "subprocess_exec", subprocess_exec)  # noqa: B010  # mypy: not for a method
     try:
         yield
     finally:
+        setattr(uvloop.Loop, "subprocess_exec", by_libuv)  # noqa: B010
         subprocess.Popen._execute_child = by_exec  # type: ignore[attr-defined]
+
+
+async def subprocess_exec(
+    loop: asyncio.AbstractEventLoop, protocol_factory: Callable[[], Any], *command: Any, **given: Any
+) -> tuple[Any, Any]:
+    """What the stock loop does: uvloop itself starts processes without `subprocess`."""
+    protocol, begun = protocol_factory(), loop.create_future()
+    given = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **given}
+    transport = OfPopen(loop, protocol, command, shell=False, bufsize=0, waiter=begun, **given)
+
+    def watch() -> None:
+        status = transport.wait()
+        with contextlib.suppress(RuntimeError):  # The loop is closed.
+            loop.call_soon_threadsafe(transport._process_exited, status)
+
+    threading.Thread(target=watch, daemon=True).start()
+    await begun
+    return transport, protocol
+
+
+class OfPopen(BaseSubprocessTransport):
+    """A process by `subprocess.Popen`, seen from any loop."""
+
+    def _start(self, args: Any, shell: bool, stdin: Any, stdout: Any, stderr: Any, bufsize: int, **given: Any) -> None:
+        self._proc = self._popen = subprocess.Popen(
+            args, shell=shell, stdin=stdin, stdout=stdout, stderr=stderr, bufsize=bufsize, **given
+        )
+
+    def wait(self) -> int:
+        return self._popen.wait()
 
 
 def _at_start(environment: dict[str, str]) -> dict[str, str]:

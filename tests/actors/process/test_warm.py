@@ -192,3 +192,28 @@ def test_a_warm_program_has_fork_servers_of_its_own_that_end_with_it(
     gone, alive = psutil.wait_procs(below, timeout=30)
     assert not alive
     assert len(gone) == len(below)
+
+
+@pytest.mark.asyncio(loop_factories=["uvloop", "asyncio"])
+async def test_a_warm_program_is_started_from_any_loop(warm_servers: WarmServers | None, tmp_path: Path) -> None:
+    if warm_servers is None:
+        pytest.skip("HOLDFAST_COLD=1: there is no warm process")
+
+    async def run() -> tuple[str, int | None]:
+        program = "import os, sys; print(sys.stdin.read(), flush=True); print(len(sys.modules)); os._exit(3)"
+        process = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-c", program), stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=tmp_path
+        )
+        output, _ = await process.communicate(b"what it reads")
+        return output.decode(), process.returncode
+
+    cold, status = await run()
+    with warm_popen(warm_servers):
+        warm, also = await run()
+        killed = await asyncio.create_subprocess_exec(sys.executable, "-c", "while True: pass")
+        killed.kill()
+        assert await killed.wait() == -signal.SIGKILL
+    (said, few), (repeated, many) = cold.split("\n")[:2], warm.split("\n")[:2]
+    assert said == repeated == "what it reads"
+    assert int(few) < int(many), "it was forked"
+    assert (status, also) == (3, 3)
