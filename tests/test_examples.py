@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 OWN_TESTS = {"rescue_robot", "fastapi_service", "tcp_server", "quick_start", "chapter_4_store"}
 """The first prints times, two serve until they are told to end, the last two are killed."""
 FOLDER = Path(__file__).parent.parent / "examples"

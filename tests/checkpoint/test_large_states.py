@@ -27,6 +27,8 @@ from tests.checkpoint.image_player import CELLS, MANY, Canvas, Digest, Paint, Sp
 from tests.checkpoint.players import start, until
 from tests.checkpoint.strikes import NEVER
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 SEED = 20_261_126
 SCRIPT = Path(__file__).with_name("large_root.py")
 PATHS = os.pathsep.join(

@@ -22,6 +22,8 @@ from holdfast.checkpoint.journal import Entry
 from holdfast.checkpoint.sqlite import SqliteJournal
 from tests.checkpoint.players import Do, Doer, Note, Notes, Seen, Sink, Tick, start, until
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 RECOVERY = hf.hybrid(interval=1000.0)
 
 

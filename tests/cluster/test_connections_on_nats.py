@@ -21,6 +21,8 @@ from tests.cluster.fleet import Client, Programs
 from tests.cluster.servers import NatsServers
 from tests.cluster.till import Clerk, Pay
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 SEED = 20261127
 PATIENT = 120.0
 """Seconds that an ask may take: far more than a takeover does."""

@@ -18,6 +18,8 @@ from tests.cluster.bank import Account, Gain
 from tests.cluster.fleet import Client, Programs
 from tests.cluster.servers import NatsServers
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 SEED = 4711
 
 

@@ -14,6 +14,8 @@ import pytest
 
 from tests.console.shown import is_shown, sections, steps
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs/five-incidents.md").read_text("utf-8")
 SECTIONS = sections(PAGE, "##")

@@ -23,6 +23,8 @@ from holdfast.testing import GuardedSystem, simulate
 from tests.effects.clerk import IN_TIME, No, lines, note
 from tests.effects.test_effects_protected import whole
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 
 class Run(hf.Message[str]):
     """Run `how` in a process: see `run`."""

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "start-actors-on-demand.md"
 STRIKE = "(os.kill(os.getpid(), 9) if sys.argv[2] == 'first' else None)"
 STEPS = {

@@ -17,6 +17,8 @@ import pytest
 import holdfast as hf
 from tests.checkpoint.players import Barrier, Let
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 PAGE = Path(__file__).parents[2] / "docs" / "pools.md"
 BORROWERS = """
 from tests.checkpoint.players import Barrier, Let, Pass

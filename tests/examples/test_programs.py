@@ -23,6 +23,8 @@ from programs import PROGRAMS
 
 import holdfast as hf
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 FOLDER = Path(__file__).parents[2] / "examples/programs"
 
 

@@ -28,6 +28,8 @@ from holdfast.ftm.model.mechanism_declaration import FAULTS, NEEDS
 from holdfast.ftm.sec import sec_errors as sec_errors
 from tests.ftm.accounts import Add, Closed, Counter, Load, Tags
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 ROOT = Path(__file__).parents[2]
 TEXT = (ROOT / "docs" / "mechanisms.md").read_text("utf-8")
 FAILOVER = (ROOT / "docs" / "failover.md").read_text("utf-8")

@@ -37,6 +37,8 @@ from holdfast.ftm.sec.sec_errors import EnrolmentRefused
 from tests.ftm.accounts import Add, Counter, Load, Tags
 from tests.ftm.sec.parties import Office
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 CA = "/app/ca"
 
 

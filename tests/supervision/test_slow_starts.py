@@ -16,6 +16,8 @@ from holdfast.testing import idle
 from tests.supervision.blockers import Blocker
 from tests.supervision.family import Boom, refused
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 SECONDS = 60.0  # of real time, far more than any of it takes
 virtual = pytest.mark.asyncio(loop_factories=["virtual"])
 

@@ -26,6 +26,8 @@ from holdfast.checkpoint.sqlite import SqliteJournal, database
 from holdfast.checkpoint.sqlite.row_codec import crc_of
 from tests.checkpoint.sqlite.stores import KEY, A, disown, edit, end, inputs, line, made, numbers, reopened, spawn
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 
 def test_the_epoch_rises_at_each_opening(path: Path) -> None:
     epochs = []

@@ -11,6 +11,8 @@ import pytest
 from tests.checkpoint.store_tools.writing import everything
 from tests.system.upgrade.shops import SHOP, killed, newer, replay
 
+pytestmark = pytest.mark.usefixtures("warm_programs")
+
 ALICE, LEDGER = "/app/bank/alice", "/app/ledger"
 SPEC = ("--spec", "shop:tree")
 
