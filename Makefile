@@ -16,8 +16,8 @@ demo: $(VENV)/.demo
 fleet: $(VENV)/.fleet
 	$(BIN)/python examples/programs/fleet.py
 
-# The tests of one file stay in one process. There is one process more than processors: many tests wait for a time limit.
-WORKERS ?= 3
+# The tests of one file stay in one process. There are twice as many as processors: many tests wait for a time limit.
+WORKERS ?= 4
 test: $(VENV)/.dev
 	$(BIN)/python -m pytest -q -n $(WORKERS) --dist loadfile $(PYTEST_ARGS)
 
