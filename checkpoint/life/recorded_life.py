@@ -85,7 +85,7 @@ from .life_state import Asked, Awaited, LifeStage, LifeTimers, LifeWaits, Restor
 from .outcome_order import OutcomeOrder, is_given_up
 from .readonly_guard import check_readonly
 from .recorded_context import Pending, RecordedContext, RecordedReplyHandle
-from .recorded_inbox import INIT, STOP, Fed, GoLive, Hook, StopRecorded, TakeSnapshot
+from .recorded_inbox import INIT, STOP, Fed, GoLive, Hook, StopRecorded, TakeSnapshot, WorkFailed
 from .replay_guard import digest_of
 
 if TYPE_CHECKING:
@@ -722,6 +722,18 @@ class Life:
     def image_lost(self) -> None:
         """Its home could not keep the last one."""
         self.saving.turn = NOT_SAVED
+
+    def work_failed(self, failed: WorkFailed) -> None:
+        """A background task has raised. If a replay has begun it, that comes to its end first, whatever its pace."""
+        if self.is_live:
+            self.cell.push(failed)
+        else:
+            self.stage.postponed.append(failed)
+
+    def save_before_crash(self) -> None:
+        """The life ends by what no replay repeats: save what a replay would lead to, and begin the same work again."""
+        if self._is_replayed_from_snapshots:
+            self.take_snapshot(is_last=True)
 
     def last_snapshot(self) -> None:
         """Save the state for a life somewhere else.

@@ -25,6 +25,7 @@ KILLING = "tests/checkpoint/test_killing_steps.py"
 
 SMALL_DISK = "tests/checkpoint/sqlite/test_small_disk.py"
 CLOCKS_SET = "tests/effects/test_clocks_set.py"
+BACKGROUND = "tests/checkpoint/test_background.py"
 BETWEEN = "tests/checkpoint/test_between_lives.py"
 TIES = "tests/checkpoint/test_ties_of_an_address.py"
 ORDER = "tests/checkpoint/test_order.py"
@@ -39,6 +40,20 @@ GIVEN_UP = "tests/checkpoint/test_given_up.py"
 WITHDRAWN = "tests/checkpoint/test_withdrawn.py"
 
 CHECKS = {
+    "a task that has raised is not begun again by a replay": Check(
+        "checkpoint/life/recorded_life.py",
+        "            self.take_snapshot(is_last=True)\n\n    def last_snapshot",
+        "            return\n\n    def last_snapshot",
+        BACKGROUND,
+        "test_a_task_that_raises_ends_one_life_of_a_recorded_actor",
+    ),
+    "a task that raises in a replay waits for its end": Check(
+        "checkpoint/life/recorded_life.py",
+        "        if self.is_live:\n            self.cell.push(failed)",
+        "        if True:\n            self.cell.push(failed)",
+        BACKGROUND,
+        "test_a_task_that_a_replay_has_begun_ends_no_replay",
+    ),
     "what a home knows of a turn is known of one behind a mechanism, too": Check(
         "system/controls.py",
         "there, names = known_at_home(told, cell), (",
