@@ -186,26 +186,32 @@ class FarParent(Parent):
             running = self.below.place.running(self.cell)
             self._over_below(unpack_exit(record.reason), running, recovers=record.recovers)
 
-    def lost(self, worker: Worker, reason: ExitReason, *, one_works: bool) -> None:
+    def lost(self, worker: Worker, reason: ExitReason, *, one_works: bool) -> bool:
         """The supervisor has died with its process, and the lives there too.
 
-        `one_works`: there was a turn in one of them that did not wait.
+        Args:
+            one_works: there was a turn in one of them that did not wait.
+
+        Returns:
+            Whether a turn of the life here has ended the process, as far as anybody knows.
         """
         if worker is not self.worker:
-            return
+            return False
         self._next = None
         if self._visitor is not None:
             self._visitor.wanted = None
         if self.on_lost is not None:
             self.on_lost(reason)
         if self.wanted is None or self.cell is None:
-            return
+            return False
         if self.is_at_root:
             self._end_unwanted(reason, recovers=True)
-        else:
-            running = self.below.place.running(self.cell)
-            is_blameless = is_innocent(worker.page[self.slot], reason, one_works=one_works)
-            self._over_below(reason, running, ordered=is_blameless, noticed=worker.end.noticed_at)
+            return False
+        running, switch = self.below.place.running(self.cell), self.home.switch
+        is_blameless = is_innocent(worker.page[self.slot], reason, one_works=one_works)
+        has_ended_it = running >= 0 and not is_blameless and switch is not None and switch.life.is_released
+        self._over_below(reason, running, ordered=is_blameless, noticed=worker.end.noticed_at)
+        return has_ended_it
 
     # -- the end of a life ------------------------------------------------------------------------------------------
 

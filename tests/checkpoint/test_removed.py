@@ -40,6 +40,13 @@ GIVEN_UP = "tests/checkpoint/test_given_up.py"
 WITHDRAWN = "tests/checkpoint/test_withdrawn.py"
 
 CHECKS = {
+    "a turn that ends the process of a supervisor which still starts is no failed start": Check(
+        "actors/process/process_host.py",
+        "            if self.has_ended_in_turn:\n                return  # That",
+        "            if False:\n                return  # That",
+        "tests/checkpoint/test_restart_root.py",
+        "test_a_turn_that_kills_its_process_when_it_is_run_again",
+    ),
     "a task that has raised is not begun again by a replay": Check(
         "checkpoint/life/recorded_life.py",
         "            self.take_snapshot(is_last=True)\n\n    def last_snapshot",
