@@ -310,6 +310,9 @@ class Parent:
         """Whether the life here has ended with the supervisor's process, and no other one is wanted here."""
         return False
 
+    def begins_without(self, cell: Cell) -> None:
+        """The supervisor has been started again, and does not bring back the actor that lived here."""
+
     def leaves(self, *, is_restarting: bool) -> None:
         """The supervisor gives up the address; it may have been started again by its own (`is_restarting`)."""
 

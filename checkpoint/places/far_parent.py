@@ -283,6 +283,16 @@ class FarParent(Parent):
     def has_lost(self) -> bool:
         return self.wanted is None and self._next is None
 
+    def begins_without(self, cell: Cell) -> None:
+        if not self.has_lost or self.cell is not cell:
+            return
+        left = self._left()
+        if left:  # Else who has asked what was in hand would hear that it was not begun.
+            asyncio.gather(*left, return_exceptions=True).add_done_callback(lambda _: self.begins_without(cell))
+        else:
+            self.leaves(is_restarting=True)
+            lifecycle.retire(cell, "its supervisor has ended")
+
     def leaves(self, *, is_restarting: bool) -> None:
         self._is_restarting = is_restarting
 

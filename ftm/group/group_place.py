@@ -545,7 +545,7 @@ class GroupPlace(Place):
         if self._starting is not None and not self._starting.done():
             self._starting.cancel()
         else:
-            self._begin_end(cell, reason, -1, ordered=True)
+            self._begin_end(cell, reason, self.running(cell), ordered=True)
 
     def left(self, cell: Cell) -> list[asyncio.Future[Any]]:
         return [task for task in (self._ending, self._starting) if task is not None and not task.done()]

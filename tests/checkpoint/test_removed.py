@@ -40,6 +40,34 @@ GIVEN_UP = "tests/checkpoint/test_given_up.py"
 WITHDRAWN = "tests/checkpoint/test_withdrawn.py"
 
 CHECKS = {
+    "a recorded actor hears of the end of its own child in a turn": Check(
+        "checkpoint/life/recorded_life.py",
+        "        if not isinstance(item, (links.Exit, links.Down)):\n            super().push(cell, item)",
+        "        if True:\n            super().push(cell, item)",
+        TIES,
+        "test_the_end_of_a_child_in_the_same_process",
+    ),
+    "a supervisor whose process has died begins without a child, and nobody waits for that": Check(
+        "checkpoint/home/homes.py",
+        "                switch.cell.host.parent.begins_without(switch.cell)\n",
+        "                pass\n",
+        "tests/checkpoint/test_subtree.py",
+        "test_who_asks_a_child_that_nobody_starts_again and supervisor-process",
+    ),
+    "what was in hand of a child at the root is known before its address is given up": Check(
+        "checkpoint/places/far_parent.py",
+        "        left = self._left()\n        if left:  # Else who",
+        "        left = []\n        if left:  # Else who",
+        "tests/checkpoint/test_subtree.py",
+        "test_who_asks_a_child_that_nobody_starts_again and pbr-process",
+    ),
+    "what was in hand behind a mechanism is known when its life is ended": Check(
+        "ftm/group/group_place.py",
+        "self._begin_end(cell, reason, self.running(cell), ordered=True)",
+        "self._begin_end(cell, reason, -1, ordered=True)",
+        "tests/checkpoint/test_subtree.py",
+        "test_who_asks_a_child_that_nobody_starts_again and pbr-process",
+    ),
     "a turn that ends the process of a supervisor which still starts is no failed start": Check(
         "actors/process/process_host.py",
         "            if self.has_ended_in_turn:\n                return  # That",
