@@ -28,7 +28,7 @@ from ...actors.errors import (
 )
 from ...actors.events import RecordsMapped
 from ...actors.exit_reasons import ExitReason
-from ...actors.kernel import lifecycle, mailbox
+from ...actors.kernel import lifecycle, links, mailbox
 from ...actors.kernel.actor import Actor, Start
 from ...actors.kernel.cell import DOWN, RUNNING, Cell
 from ...actors.kernel.codec import known_at
@@ -832,6 +832,11 @@ class LifePlace(lifecycle.HerePlace):
 
 class FedHome(lifecycle.MailboxHome):
     """What the actor's home at the root has fed to the life in this process."""
+
+    def push(self, cell: Cell, item: Item) -> None:
+        """What comes from others is an input: of the end of an actor in this process, too, the root tells the home."""
+        if not isinstance(item, (links.Exit, links.Down)):
+            super().push(cell, item)
 
     def recovers(self, reason: ExitReason) -> bool:
         return not reason.is_clean
