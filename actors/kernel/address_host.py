@@ -69,6 +69,10 @@ class Home:
         """Whether the next life knows all that the last one has handled, and goes on with the turn in hand."""
         return False
 
+    def goes_on_with(self, key: int) -> bool:
+        """Whether the next life goes on with the turn of this recorded input, which the last one had in hand."""
+        return self.keeps_turns
+
     def push(self, cell: Cell, item: Item) -> None:
         """Put an item of the runtime's own in its place behind the messages."""
         raise NotImplementedError

@@ -131,6 +131,9 @@ class JournalHome(RecordedHome):
     def keeps_turns(self) -> bool:
         return self.method.replays
 
+    def goes_on_with(self, key: int) -> bool:
+        return self.keeps_turns and self.switch is not None and key in self.switch.open
+
     @property
     def is_gated(self) -> bool:
         """Whether the recovery of the life at hand waits for somebody on its way, or for the store."""

@@ -329,7 +329,7 @@ CHECKS = {
     ),
     "a lock of a turn that nobody goes on with is free": Check(
         "supervision/services/registrar.py",
-        "            self._drop_claims(holder, lambda claim: True)\n",
+        "            self._drop_claims(holder, lambda claim: not holder.host.home.goes_on_with(claim.turn))\n",
         "            pass\n",
         REGISTRY_PROTECTED,
         "over_a_kill and checkpoint_only",
@@ -341,10 +341,17 @@ CHECKS = {
         REGISTRY_PROTECTED,
         "over_a_kill and hybrid-process and not pbr",
     ),
+    "a lock of a turn that is put aside is free": Check(
+        "checkpoint/home/journal_home.py",
+        "self.keeps_turns and self.switch is not None and key in self.switch.open",
+        "self.keeps_turns",
+        REGISTRY_PROTECTED,
+        "put_aside and hybrid-process or put_aside and pbr",
+    ),
     "a lock of a turn that is gone on with is kept": Check(
         "supervision/services/registrar.py",
-        " and not holder.host.home.keeps_turns:",
-        ":",
+        "lambda claim: not holder.host.home.goes_on_with(claim.turn)",
+        "lambda claim: True",
         REGISTRY_PROTECTED,
         "over_a_kill and hybrid and not pbr and not process",
     ),
