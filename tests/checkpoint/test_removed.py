@@ -40,6 +40,27 @@ GIVEN_UP = "tests/checkpoint/test_given_up.py"
 WITHDRAWN = "tests/checkpoint/test_withdrawn.py"
 
 CHECKS = {
+    "a file of somebody else is no damaged store": Check(
+        "checkpoint/sqlite/store_parts.py",
+        "            self._refuse_stranger()\n",
+        "",
+        "tests/checkpoint/sqlite/test_damage.py",
+        "test_another_file_is_refused",
+    ),
+    "a damaged store is no file of somebody else": Check(
+        "checkpoint/sqlite/store_parts.py",
+        "        if not all(map(_is_unused, self.folders)):\n            return\n",
+        "",
+        "tests/checkpoint/sqlite/test_damage.py",
+        "test_a_store_of_which_the_header",
+    ),
+    "an empty file is left alone": Check(
+        "checkpoint/sqlite/open_store.py",
+        "        if is_there and os.path.getsize(self.path) == 0:",
+        "        if False:",
+        "tests/checkpoint/sqlite/test_damage.py",
+        "test_an_empty_file",
+    ),
     "a recorded actor hears of the end of its own child in a turn": Check(
         "checkpoint/life/recorded_life.py",
         "        if not isinstance(item, (links.Exit, links.Down)):\n            super().push(cell, item)",
