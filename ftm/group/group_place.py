@@ -594,6 +594,8 @@ class GroupPlace(Place):
             return
         if ftm.state not in (DOWN, GONE):
             ended = ftm.ended()
+            if group is not None:
+                group.replicas.dismiss()
             ftm.kill()
             await ended
         lifecycle.retire(ftm, "the mechanism has ended")
@@ -605,6 +607,7 @@ class GroupPlace(Place):
         if ftm is not None and ftm.state is not GONE:
             if self.group is not None:
                 self.group.close("it has stopped")
+                self.group.replicas.dismiss()
             ftm.kill()
         if self.probation is not None:
             self.probation.end(is_kept=True, why=UNJUDGED)

@@ -40,6 +40,13 @@ GIVEN_UP = "tests/checkpoint/test_given_up.py"
 WITHDRAWN = "tests/checkpoint/test_withdrawn.py"
 
 CHECKS = {
+    "a first start that fails is no recovery": Check(
+        "checkpoint/home/journal_home.py",
+        "        if recovers and has_begun:",
+        "        if recovers:",
+        "tests/checkpoint/test_failed_starts.py",
+        "test_a_first_start_that_fails and subtree",
+    ),
     "a file of somebody else is no damaged store": Check(
         "checkpoint/sqlite/store_parts.py",
         "            self._refuse_stranger()\n",
