@@ -110,5 +110,8 @@ async def test_a_first_start_that_fails_is_no_recovery(how: str, place: str) -> 
             well = hf.child("flow", hf.start(Flow, "well"), recovery=hf.hybrid(), **options)
             flow = await above.ask(hf.StartChild(well), timeout=30.0)
             flow.kill()
-            phase = await stream.until(hf.events.RecoveryPhase, timeout=30.0)
-            assert (phase.address, phase.phase, phase.recovery) == ("/app/above/flow", "detect", 1)
+            phases = [await stream.until(hf.events.RecoveryPhase, timeout=30.0)]
+            while phases[-1].phase != "release":
+                phases.append(await stream.until(hf.events.RecoveryPhase, timeout=30.0))
+            assert [(one.recovery, one.phase) for one in phases].count((1, "detect")) == 1
+            assert {one.recovery for one in phases} == {1}
