@@ -541,7 +541,7 @@ class ActorContext:
         has asked gets None as its reply. Everything else waits. As with `sleep_until`, the wait outlives the process.
 
         Args:
-            kinds: classes of messages whose reply is None.
+            kinds: classes of messages whose reply is None; what derives from one counts, too.
             timeout: seconds from this call on; left out, it waits for as long as it takes.
 
         Returns:

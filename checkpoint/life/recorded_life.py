@@ -319,8 +319,8 @@ class Life:
             return self.cell.node.codec.decode_reply(awaited.message, answer.body)
         if isinstance(awaited, EffectCall):
             return decode_value(answer.body, refs=self.cell.node.ref_at)
-        kind = next(kind for kind in awaited if message_name(kind) == answer.name)
-        return self.cell.node.codec.decode(kind, answer.body)
+        kind = next((kind for kind in awaited if message_name(kind) == answer.name), None)
+        return self.cell.node.codec.decode(kind or self.cell.table.kind_named(answer.name), answer.body)
 
     def _error(self, answer: Answer, awaited: Awaited) -> HoldfastError:
         """What is raised where a turn has waited."""
