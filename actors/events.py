@@ -63,7 +63,7 @@ class DeadLetter(Event, frozen=True, eq=False):
 
 
 REFUSED: Final = "refused: "
-"""How `why` begins of a message that was told, and that its handler has refused: it was handled, so it does not count."""
+"""How `why` begins if the handler has refused a message that was told: that one was handled, and is not counted."""
 
 
 class ChildRestarted(Event, frozen=True, eq=False):

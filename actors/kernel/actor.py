@@ -183,7 +183,8 @@ class Actor:
         for one in reversed(cls.__mro__):
             members.update(vars(one))
             marked.update((name, marks) for name, value in vars(one).items() if (marks := handled_by(value)))
-            heard.update((name, told) for name, value in vars(one).items() if (told := _topics_of(value)) or value is None)
+            told = ((name, _topics_of(value), value is None) for name, value in vars(one).items())
+            heard.update((name, topics) for name, topics, is_taken_away in told if topics or is_taken_away)
         for name in sorted(members):
             handler = members[name]
             marks, subscribed = handled_by(handler), _topics_of(handler)

@@ -16,7 +16,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 from ...actors.errors import ActorStopped, AskFailed, AskTimeout, HoldfastError, NoSuchActor
-from ...actors.exit_reasons import KILLED, SHUTDOWN, Crash, Exited, ExitReason, Hung, OutOfMemory, Shutdown, Signal, TrustBreach
+from ...actors.exit_reasons import (
+    KILLED,
+    SHUTDOWN,
+    Crash,
+    Exited,
+    ExitReason,
+    Hung,
+    OutOfMemory,
+    Shutdown,
+    Signal,
+    TrustBreach,
+)
 from ...actors.kernel.actor import Actor
 from ...actors.kernel.cell import RUNNING, Cell
 from ...actors.kernel.message import Message, message_name
@@ -414,7 +425,7 @@ class Replicas:
             await worker.gone()
 
     def dismiss(self) -> None:
-        """Kill the processes of all replicas, for the mechanism is taken away or has ended: no end of one is a fault."""
+        """Kill the processes of all replicas, since the mechanism has ended, or is taken away: that is no fault."""
         for name in self.membership.names:
             worker = self.worker_of(name)
             if worker is not None:

@@ -188,7 +188,10 @@ async def test_topics_and_addresses_are_different_name_spaces(system: hf.ActorSy
     assert (await one.ask(Seen()), await other.ask(Seen())) == ([], [1])
 
 
-@pytest.mark.parametrize("base", [Subscriber, type("Mixin", (), {"news": Subscriber.news})], ids=["an actor", "a mixin"])
+MIXIN = type("Mixin", (), {"news": Subscriber.news})
+
+
+@pytest.mark.parametrize("base", [Subscriber, MIXIN], ids=["an actor", "a mixin"])
 def test_what_stands_in_the_place_of_a_subscription_says_whether_it_is_one(base: type) -> None:
     bases = (base,) if issubclass(base, hf.Actor) else (base, hf.Actor)
 
@@ -198,9 +201,7 @@ def test_what_stands_in_the_place_of_a_subscription_says_whether_it_is_one(base:
     says = r'Silent\.news .* subscribes.* write @subscribe\("/more"\) and @subscribe\("/news"\) above it, too'
     with pytest.raises(TypeError, match=says):
         type("Silent", bases, {"news": news})
-    elsewhere: Any = type("Elsewhere", bases, {"news": hf.subscribe("/elsewhere")(hf.on(News)(lambda self, message: None))})
-    assert elsewhere._topics == ("/elsewhere",)
     without: Any = type("Without", bases, {"news": None, "quietly": news})
     assert (without._topics, News in without._table) == ((), True)
-    again: Any = type("Again", (without,), {"quietly": news, "news": None})
-    assert again._topics == ()
+    elsewhere: Any = type("Elsewhere", bases, {"news": hf.subscribe("/elsewhere")(news)})
+    assert elsewhere._topics == ("/elsewhere",)

@@ -51,7 +51,7 @@ async def test_what_derives_is_waited_for(place: str, when: str) -> None:
             for notice in NOTICES:
                 while "wait_for" not in (await system.get_status(clerk)).turn_at:
                     await asyncio.sleep(0)
-                assert await clerk.ask(notice, timeout=60.0) is None
+                await clerk.ask(notice, timeout=60.0)
                 clerk.kill()
         assert await gathered == [repr(notice) for notice in NOTICES]
 

@@ -82,7 +82,7 @@ async def test_crashes_refusals_and_letters_are_counted() -> None:
 async def test_letters_are_counted_once_wherever_they_become_dead(place: str, recovery: Any) -> None:
     """Also in a storm, of which the history and the log tell but a part."""
     protected = {"pbr": hf.ftm.PBR(), "lfr": hf.ftm.LFR()}
-    own = {"process": {"isolation": "process"}}.get(place, {})
+    own: dict[str, Any] = {"isolation": "process"} if place == "process" else {}
     careless = hf.child("one", hf.start(Careless), recovery=recovery, mechanism=protected.get(place), **own)
     async with hf.ActorSystem("app", log=False) as system:
         metrics = Metrics(system)

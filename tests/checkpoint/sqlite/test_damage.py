@@ -192,7 +192,7 @@ async def test_another_file_is_refused_and_left_alone(path: Path, what: str) -> 
         else:
             path.write_text("some text " * (1000 if what == "text" else 1))
         before = everything(path.parent)
-        with pytest.raises(ForeignStore, match="this is not a holdfast store, but .*; give the store another path"):
+        with pytest.raises(ForeignStore, match=r"this is not a holdfast store, but .*; give the store another path"):
             async with hf.ActorSystem("app", store=f"sqlite:{path}", log=False):
                 raise AssertionError("it has begun")
         with pytest.raises(ForeignStore, match="not a holdfast store"):
