@@ -64,7 +64,7 @@ class Clerk(hf.Actor):
 
     @hf.on(Gather)
     async def gather(self, message: Gather) -> list[str]:
-        return [repr(await self.ctx.wait_for(Notice, timeout=60.0)) for _ in range(message.count)]
+        return [repr(await self.ctx.wait_for(Notice, timeout=20.0)) for _ in range(message.count)]
 
     @hf.on(Notice)
     def late(self, message: Notice) -> None: ...
