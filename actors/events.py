@@ -8,7 +8,7 @@ import math
 import typing
 from collections import deque
 from collections.abc import AsyncIterator, Callable
-from typing import Any, Literal, TypeVar
+from typing import Any, Final, Literal, TypeVar
 
 import msgspec
 
@@ -60,6 +60,10 @@ class DeadLetter(Event, frozen=True, eq=False):
     message: Any
     why: str
     sender: str = ""
+
+
+REFUSED: Final = "refused: "
+"""How `why` begins if the handler has refused a message that was told: that one was handled, and is not counted."""
 
 
 class ChildRestarted(Event, frozen=True, eq=False):

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Final, Literal, TypeAlias
 
 import msgspec
 
-from ..actors.errors import WaitTimeout
+from ..actors.errors import UnknownMessage, WaitTimeout
 from ..actors.kernel.cell import TurnRest
+from ..actors.kernel.message import message_name
 from .inputs import Batch, Input
 from .protocol import MESSAGE, MOMENT, REPLY, SINCE_THEN, Answer, Glance, Glanced, Out, timed
 
@@ -104,8 +105,21 @@ class LongWaits:
     def _suits(self, source: Input, names: str, running: int) -> bool:
         """Whether an input is a message that a turn waits for, and nobody has begun it."""
         is_free = source.kind == MESSAGE and source.id != running and not source.held
-        is_wanted = is_free and source.name in names.split("|") and source.id not in self._home.ledger.stashed()
+        is_wanted = is_free and self._is_of(source, names) and source.id not in self._home.ledger.stashed()
         return is_wanted and not self._is_given_up(source)
+
+    def _is_of(self, source: Input, names: str) -> bool:
+        """Whether a message is of one of these types, or, as far as that is known here, of one that derives from it."""
+        wanted, cell = names.split("|"), self._home.cell
+        if source.name in wanted:
+            return True
+        if not names or cell is None:
+            return False
+        try:
+            kind = cell.table.kind_named(source.name)
+        except UnknownMessage:
+            return False
+        return any(message_name(base) in wanted for base in kind.__mro__)
 
     def _is_given_up(self, source: Input) -> bool:
         """Whether nobody waits any more for what an input was to lead to."""
@@ -113,8 +127,10 @@ class LongWaits:
 
     def takes(self, source: Input) -> bool:
         """Whether a message that has come is what a turn waits for; it has it then."""
-        place = next((place for place, names in self.wanted.items() if source.name in names.split("|")), None)
-        if place is None or source.kind != MESSAGE or self._is_given_up(source):
+        if source.kind != MESSAGE:
+            return False
+        place = next((place for place, names in self.wanted.items() if self._is_of(source, names)), None)
+        if place is None or self._is_given_up(source):
             return False
         self._take(place, source)
         return True

@@ -179,9 +179,12 @@ class Actor:
             raise TypeError(f"{type_name(cls)}.__init__ cannot be async: what has to be awaited goes into on_start")
         table, declared, topics = Table(), dict[type, Handles](), list[str]()
         members, marked = dict[str, Any](), dict[str, tuple[Handles, ...]]()
+        heard = dict[str, tuple[str, ...]]()  # the topics of a handler, or of the one in whose place it stands
         for one in reversed(cls.__mro__):
             members.update(vars(one))
             marked.update((name, marks) for name, value in vars(one).items() if (marks := handled_by(value)))
+            told = ((name, _topics_of(value), value is None) for name, value in vars(one).items())
+            heard.update((name, topics) for name, topics, is_taken_away in told if topics or is_taken_away)
         for name in sorted(members):
             handler = members[name]
             marks, subscribed = handled_by(handler), _topics_of(handler)
@@ -200,6 +203,12 @@ class Actor:
                 turn = noting(turn) if issubclass(handles.kind, RuntimeOrder) else turn
                 table[handles.kind] = checking(turn) if issubclass(handles.kind, RuntimeCall) else turn
                 declared[handles.kind] = handles
+            if marks and not subscribed and heard.get(name):
+                lost = " and ".join(f'@subscribe("{topic}")' for topic in heard[name])
+                raise TypeError(
+                    f"{type_name(cls)}.{name} stands in the place of a handler that subscribes, and does not: write "
+                    f"{lost} above it, too, or, if it is not to, give it another name and write `{name} = None`"
+                )
             if subscribed and not marks:
                 raise TypeError(f"{type_name(cls)}.{name} has @subscribe without @on: nothing would ever reach it")
             topics.extend(subscribed)

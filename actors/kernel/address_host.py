@@ -69,6 +69,10 @@ class Home:
         """Whether the next life knows all that the last one has handled, and goes on with the turn in hand."""
         return False
 
+    def goes_on_with(self, key: int) -> bool:
+        """Whether the next life goes on with the turn of this recorded input, which the last one had in hand."""
+        return self.keeps_turns
+
     def push(self, cell: Cell, item: Item) -> None:
         """Put an item of the runtime's own in its place behind the messages."""
         raise NotImplementedError
@@ -309,6 +313,9 @@ class Parent:
     def has_lost(self) -> bool:
         """Whether the life here has ended with the supervisor's process, and no other one is wanted here."""
         return False
+
+    def begins_without(self, cell: Cell) -> None:
+        """The supervisor has been started again, and does not bring back the actor that lived here."""
 
     def leaves(self, *, is_restarting: bool) -> None:
         """The supervisor gives up the address; it may have been started again by its own (`is_restarting`)."""

@@ -541,7 +541,7 @@ class ActorContext:
         has asked gets None as its reply. Everything else waits. As with `sleep_until`, the wait outlives the process.
 
         Args:
-            kinds: classes of messages whose reply is None.
+            kinds: classes of messages whose reply is None; what derives from one counts, too.
             timeout: seconds from this call on; left out, it waits for as long as it takes.
 
         Returns:
@@ -803,7 +803,11 @@ class ActorContext:
 
     def _task_done(self, task: asyncio.Task[Any]) -> None:
         if not task.cancelled() and (error := task.exception()) is not None and not self._closed:
-            self._cell.push(Piped(None, uncontained(error)))
+            self._work_failed(Piped(None, uncontained(error)))
+
+    def _work_failed(self, failed: Piped) -> None:
+        """A background task has raised: this ends the life when its turn has come."""
+        self._cell.push(failed)
 
 
 async def contained(work: Coroutine[Any, Any, T]) -> T:
@@ -847,6 +851,9 @@ class Piped(Item):
         if item.message is None:
             raise item.error
         return actor._table[type(item.message)](actor, item.message)
+
+    def hook(self) -> str:
+        return "background work"
 
 
 def waits_for(asker: ActorContext, cell: Cell, chain: Chain) -> bool:

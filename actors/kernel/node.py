@@ -28,7 +28,7 @@ from ..errors import (
     shown,
     type_name,
 )
-from ..events import DeadLetter, Event, EventHub, SupervisorGaveUp
+from ..events import REFUSED, DeadLetter, Event, EventHub, SupervisorGaveUp
 from ..exit_reasons import ExitReason
 from ..persistence import Keeper, NothingKept
 from ..values.path_parts import check_beside, check_path_part
@@ -310,7 +310,7 @@ class Node(RunLoop):
         """A tell was answered with a Refusal, or was no valid order: there is nobody to hand that to."""
         if self.events.hears_letters:
             known = item.sender.path if isinstance(item, Item) and item.sender is not None else ""
-            self.events.emit(DeadLetter(cell.path, item, f"refused: {no}", known))
+            self.events.emit(DeadLetter(cell.path, item, f"{REFUSED}{no}", known))
 
     def count_no_room(self, path: str, where: NoRoom = "mailbox") -> None:
         """Count a message that an actor had no room for, and that is refused or lost."""

@@ -461,6 +461,11 @@ class WorkerPlace(Place):
         self.parent = parent
 
     @property
+    def has_ended_in_turn(self) -> bool:
+        """Whether a turn of an actor in the last process has ended it, though the process's own was still starting."""
+        return False
+
+    @property
     def is_ending(self) -> bool:
         """Whether the life in the process has been told to stop."""
         return self.stop_sent is not None or self._stop_wanted is not None
@@ -518,6 +523,8 @@ class WorkerPlace(Place):
             await self.home.goes_on(cell, worker, entered)
         except StartFailed:
             await worker.gone()  # The next life begins when this one is over.
+            if self.has_ended_in_turn:
+                return  # That is told by its end, and no start has failed.
             raise
         self.settled(cell)
 

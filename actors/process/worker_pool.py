@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from ..control.orders import ObserveTurns
 from ..control.orders_lane import order, send_call
 from ..errors import AskFailed, ProcessUnavailable, StartFailed, StartIgnored
-from ..events import TRACED, HelperStuck, LogLine, ProcessDied, ProcessStarted, TrustBreached
+from ..events import REFUSED, TRACED, DeadLetter, HelperStuck, LogLine, ProcessDied, ProcessStarted, TrustBreached
 from ..exit_reasons import KILLED, ExitReason, ForkServerDied, Hung, TrustBreach, pack_exit, unpack_exit
 from ..kernel.cell import Cell
 from ..migration.words import NO_ATTEMPT, say
@@ -606,6 +606,8 @@ class Workers:
         from ..events import event_from
 
         event = event_from(frame.kind, frame.data)
+        if isinstance(event, DeadLetter) and not event.why.startswith(REFUSED):
+            self.node.numbers.dead_letters += 1
         if isinstance(event, TRACED):
             cell = self.node.find(event.address)
             if cell is not None and cell.more is not None and cell.more.tap is not None:

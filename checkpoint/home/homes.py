@@ -416,6 +416,13 @@ class Homes:
 
     def began(self, path: str, listed: Collection[str]) -> None:
         """The supervisor at `path` begins with these children: nobody else is brought back below it."""
+        names = frozenset(listed)
+        for below in self.known(path):
+            switch = self._switches.get(below)
+            if switch is None or switch.cell is None or switch.intake.between is not None:
+                continue
+            if below[len(path) + 1 :].partition("/")[0] not in names:
+                switch.cell.host.parent.begins_without(switch.cell)
         self.addresses.absentees.began(path, listed)
         self.rejoin.next_lives.began(path, listed)
 

@@ -131,6 +131,9 @@ class JournalHome(RecordedHome):
     def keeps_turns(self) -> bool:
         return self.method.replays
 
+    def goes_on_with(self, key: int) -> bool:
+        return self.keeps_turns and self.switch is not None and key in self.switch.open
+
     @property
     def is_gated(self) -> bool:
         """Whether the recovery of the life at hand waits for somebody on its way, or for the store."""
@@ -200,12 +203,12 @@ class JournalHome(RecordedHome):
         self.clock.mark("noticed", noticed)
         self.clock.mark("detect")
         end = self.cause(cell.extra().reason if reason is None else reason)
-        has_hung = self.fault == "hung" or isinstance(end, Hung)
+        has_hung, has_begun = self.fault == "hung" or isinstance(end, Hung), not switch.ledger.is_new
         switch.died(running, ordered=ordered and not self.fault, has_hung=has_hung, reason=end)
         self.fault = ""
         if recovers is None:
             recovers = self.recovers(end) and cell.spec is not None and cell.spec.restarts(end)
-        if recovers:
+        if recovers and has_begun:  # Else its first start has failed, and there is nothing to recover.
             hold(switch, running)
             self.homes.recoveries.crashed(cell.path, self.method, noticed)
         cell.extra().belongings.topics.clear()  # These would be unsubscribed with the life.

@@ -32,7 +32,7 @@ from ...actors.exit_reasons import NORMAL, SHUTDOWN, ExitReason, check_reason, p
 from ...actors.kernel.actor import Actor, Start
 from ...actors.kernel.bindings import note_order
 from ...actors.kernel.cell import Cell, Order
-from ...actors.kernel.context import NO_MESSAGE, ActorContext, StashError
+from ...actors.kernel.context import NO_MESSAGE, ActorContext, Piped, StashError
 from ...actors.kernel.envelope import Ask, Item, ReplyHandle, require_error
 from ...actors.kernel.links import MADE_UP_NAME, Monitor
 from ...actors.kernel.message import Message, message_name, require_message
@@ -46,7 +46,7 @@ from ...actors.values.saved_refs import SavedHandle
 from ..protocol import REPLY, SINCE_THEN, Answer, EndWanted, Feed, Perform, Performed, PipeDone, Retried
 from .glances import seen_beside
 from .life_state import Asked
-from .recorded_inbox import INIT, STARTED, Fed
+from .recorded_inbox import INIT, STARTED, Fed, WorkFailed
 
 if TYPE_CHECKING:
     from .life_state import Awaited
@@ -458,6 +458,9 @@ class RecordedContext(ActorContext):
             self.recorded.port.to_home(record)
             if k:
                 self.recorded.pipe_back()
+
+    def _work_failed(self, failed: Piped) -> None:
+        self.recorded.work_failed(WorkFailed(self.recorded, failed.error))
 
     # -- the outside ------------------------------------------------------------------------------------------------
 

@@ -12,6 +12,7 @@ from ...actors.exit_reasons import NORMAL, ExitReason, recorded_exit
 from ...actors.kernel import lifecycle
 from ...actors.kernel.actor import Actor
 from ...actors.kernel.cell import Cell
+from ...actors.kernel.context import Piped
 from ...actors.kernel.envelope import LEAVE, Chain, Item, ReplyHandle
 from ...actors.kernel.message import Refusal
 from ..protocol import CRASH, DROPPED, LATER, NO_ANSWER, OK, START, STASHED, Answer, Feed, Go
@@ -224,6 +225,21 @@ class GoLive(Hook):
         self.life.stage.begun = self.go.begun
         self.life.stage.judge(self.go)
         self.life.go_live(self.go.gone)
+
+
+class WorkFailed(Piped):
+    """A background task has raised: the life ends, and the next one does not begin that task again by a replay."""
+
+    __slots__ = ("life",)
+
+    def __init__(self, life: Life, error: BaseException | None) -> None:
+        super().__init__(None, error)
+        self.life = life
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        item.life.save_before_crash()
+        return Piped.run(actor, item)
 
 
 class TakeSnapshot(Item):

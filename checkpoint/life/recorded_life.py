@@ -28,7 +28,7 @@ from ...actors.errors import (
 )
 from ...actors.events import RecordsMapped
 from ...actors.exit_reasons import ExitReason
-from ...actors.kernel import lifecycle, mailbox
+from ...actors.kernel import lifecycle, links, mailbox
 from ...actors.kernel.actor import Actor, Start
 from ...actors.kernel.cell import DOWN, RUNNING, Cell
 from ...actors.kernel.codec import known_at
@@ -85,7 +85,7 @@ from .life_state import Asked, Awaited, LifeStage, LifeTimers, LifeWaits, Restor
 from .outcome_order import OutcomeOrder, is_given_up
 from .readonly_guard import check_readonly
 from .recorded_context import Pending, RecordedContext, RecordedReplyHandle
-from .recorded_inbox import INIT, STOP, Fed, GoLive, Hook, StopRecorded, TakeSnapshot
+from .recorded_inbox import INIT, STOP, Fed, GoLive, Hook, StopRecorded, TakeSnapshot, WorkFailed
 from .replay_guard import digest_of
 
 if TYPE_CHECKING:
@@ -319,8 +319,8 @@ class Life:
             return self.cell.node.codec.decode_reply(awaited.message, answer.body)
         if isinstance(awaited, EffectCall):
             return decode_value(answer.body, refs=self.cell.node.ref_at)
-        kind = next(kind for kind in awaited if message_name(kind) == answer.name)
-        return self.cell.node.codec.decode(kind, answer.body)
+        kind = next((kind for kind in awaited if message_name(kind) == answer.name), None)
+        return self.cell.node.codec.decode(kind or self.cell.table.kind_named(answer.name), answer.body)
 
     def _error(self, answer: Answer, awaited: Awaited) -> HoldfastError:
         """What is raised where a turn has waited."""
@@ -723,6 +723,18 @@ class Life:
         """Its home could not keep the last one."""
         self.saving.turn = NOT_SAVED
 
+    def work_failed(self, failed: WorkFailed) -> None:
+        """A background task has raised. If a replay has begun it, that comes to its end first, whatever its pace."""
+        if self.is_live:
+            self.cell.push(failed)
+        else:
+            self.stage.postponed.append(failed)
+
+    def save_before_crash(self) -> None:
+        """The life ends by what no replay repeats: save what a replay would lead to, and begin the same work again."""
+        if self._is_replayed_from_snapshots:
+            self.take_snapshot(is_last=True)
+
     def last_snapshot(self) -> None:
         """Save the state for a life somewhere else.
 
@@ -820,6 +832,11 @@ class LifePlace(lifecycle.HerePlace):
 
 class FedHome(lifecycle.MailboxHome):
     """What the actor's home at the root has fed to the life in this process."""
+
+    def push(self, cell: Cell, item: Item) -> None:
+        """What comes from others is an input: of the end of an actor in this process, too, the root tells the home."""
+        if not isinstance(item, (links.Exit, links.Down)):
+            super().push(cell, item)
 
     def recovers(self, reason: ExitReason) -> bool:
         return not reason.is_clean

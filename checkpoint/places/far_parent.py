@@ -186,26 +186,32 @@ class FarParent(Parent):
             running = self.below.place.running(self.cell)
             self._over_below(unpack_exit(record.reason), running, recovers=record.recovers)
 
-    def lost(self, worker: Worker, reason: ExitReason, *, one_works: bool) -> None:
+    def lost(self, worker: Worker, reason: ExitReason, *, one_works: bool) -> bool:
         """The supervisor has died with its process, and the lives there too.
 
-        `one_works`: there was a turn in one of them that did not wait.
+        Args:
+            one_works: there was a turn in one of them that did not wait.
+
+        Returns:
+            Whether a turn of the life here has ended the process, as far as anybody knows.
         """
         if worker is not self.worker:
-            return
+            return False
         self._next = None
         if self._visitor is not None:
             self._visitor.wanted = None
         if self.on_lost is not None:
             self.on_lost(reason)
         if self.wanted is None or self.cell is None:
-            return
+            return False
         if self.is_at_root:
             self._end_unwanted(reason, recovers=True)
-        else:
-            running = self.below.place.running(self.cell)
-            is_blameless = is_innocent(worker.page[self.slot], reason, one_works=one_works)
-            self._over_below(reason, running, ordered=is_blameless, noticed=worker.end.noticed_at)
+            return False
+        running, switch = self.below.place.running(self.cell), self.home.switch
+        is_blameless = is_innocent(worker.page[self.slot], reason, one_works=one_works)
+        has_ended_it = running >= 0 and not is_blameless and switch is not None and switch.life.is_released
+        self._over_below(reason, running, ordered=is_blameless, noticed=worker.end.noticed_at)
+        return has_ended_it
 
     # -- the end of a life ------------------------------------------------------------------------------------------
 
@@ -276,6 +282,16 @@ class FarParent(Parent):
     @property
     def has_lost(self) -> bool:
         return self.wanted is None and self._next is None
+
+    def begins_without(self, cell: Cell) -> None:
+        if not self.has_lost or self.cell is not cell:
+            return
+        left = self._left()
+        if left:  # Else who has asked what was in hand would hear that it was not begun.
+            asyncio.gather(*left, return_exceptions=True).add_done_callback(lambda _: self.begins_without(cell))
+        else:
+            self.leaves(is_restarting=True)
+            lifecycle.retire(cell, "its supervisor has ended")
 
     def leaves(self, *, is_restarting: bool) -> None:
         self._is_restarting = is_restarting

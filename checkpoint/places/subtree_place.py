@@ -29,6 +29,11 @@ class SubtreePlace(WorkerPlace):
         self._homes, self._lives = homes, lives
         self._below: dict[str, FarParent] = {}
         self._slots: Slots | None = None
+        self._has_ended_in_turn = False
+
+    @property
+    def has_ended_in_turn(self) -> bool:
+        return self._has_ended_in_turn
 
     async def take(self, cell: Cell) -> tuple[Worker, bytes]:
         worker, recipe = await super().take(cell)
@@ -85,8 +90,8 @@ class SubtreePlace(WorkerPlace):
         worker = self.workers.of(cell)
         if worker is not None:
             one_works = self._slots is not None and self._slots.is_any_at_work(worker.page)
-            for parent in self._below.values():
-                parent.lost(worker, reason, one_works=one_works)
+            ended_it = [parent.lost(worker, reason, one_works=one_works) for parent in self._below.values()]
+            self._has_ended_in_turn = any(ended_it)
         super().died(cell, reason)
 
     def retired(self, cell: Cell) -> None:

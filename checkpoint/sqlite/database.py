@@ -14,9 +14,8 @@ from ..journal import DamagedStore
 from .row_codec import crc_of
 from .sealing import FORMATS, Cipher, format_of
 from .snapshot_files import sync
-from .store_parts import new_cipher, new_notes
+from .store_parts import APPLICATION, new_cipher, new_notes
 
-_APPLICATION: Final = 0x486F6C64  # "Hold", in the file header
 _TABLES: Final = {
     "store": "one INTEGER PRIMARY KEY, epoch INTEGER, pid INTEGER, start TEXT, floor INTEGER, live INTEGER, "
     "crc INTEGER",
@@ -71,7 +70,7 @@ def _write_database(path: str, key: bytes | None) -> None:
 def create_tables(db: sqlite3.Connection, cipher: Cipher) -> None:
     """Make a new database a store without contents and without an identity."""
     db.execute("PRAGMA journal_mode = WAL")
-    db.execute(f"PRAGMA application_id = {_APPLICATION}")
+    db.execute(f"PRAGMA application_id = {APPLICATION}")
     db.execute(f"PRAGMA user_version = {format_of(cipher, may_have_log=False)}")
     for statement in _SCHEMA:
         db.execute(statement)
@@ -103,7 +102,7 @@ def refuse_foreign(db: sqlite3.Connection, path: str, *, is_wal: bool = True) ->
     (application,) = db.execute("PRAGMA application_id").fetchone()
     (version,) = db.execute("PRAGMA user_version").fetchone()
     (mode,) = db.execute("PRAGMA journal_mode").fetchone()
-    if application != _APPLICATION or (is_wal and mode != "wal"):
+    if application != APPLICATION or (is_wal and mode != "wal"):
         raise DamagedStore(path, None, None, "this is not a holdfast store")
     if version not in FORMATS:
         reason = f"its format is {version}, this holdfast reads {FORMATS[0]} to {FORMATS[-1]}"

@@ -125,6 +125,8 @@ class Store:
 
     def _connect(self) -> None:
         is_there = self.parts.inspect()
+        if is_there and os.path.getsize(self.path) == 0:  # SQLite would take it for a new database
+            raise DamagedStore(self.path, None, None, "the file is empty")
         if is_there:
             refuse_copy(self.parts)
         with contextlib.suppress(FileExistsError):
@@ -132,8 +134,6 @@ class Store:
         if not is_there:
             self.log.make_folder()
             create_database(self.path, self.files.folder, self.parts.key)
-        if os.path.getsize(self.path) == 0:  # SQLite would take it for a new database
-            raise DamagedStore(self.path, None, None, "the file is empty")
         self.db, self.reader = connect(self.path), connect(self.path)
         self.claim = StoreClaim(self.db, self.parts)
 

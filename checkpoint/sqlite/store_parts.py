@@ -30,6 +30,8 @@ from .sealing import Cipher, NoCipher, StoreCipher, is_sealed
 from .snapshot_files import write_durably
 
 T = TypeVar("T")
+APPLICATION: Final = 0x486F6C64
+"""Stands in the header of each database that is a store: "Hold", in letters."""
 NOTE: Final = "\0store"
 """The note with the identity. No user's note has such a name, and nobody is shown it."""
 COPY_NOTE: Final = "\0copy"
@@ -159,11 +161,34 @@ class Parts:
                 "remove all but one of them",
             )
         if found.st_size:
+            self._refuse_stranger()
             try:
                 self._compare_read()
             except ForeignStore:
                 self._compare_read()  # Its owner may have given it an identity just between two looks.
         return True
+
+    def _refuse_stranger(self) -> None:
+        """Refuse a file that is no store, unless folders of one lie beside it: then it is a store that is damaged.
+
+        Raises:
+            ForeignStore: it is another program's database, or none at all.
+        """
+        if not all(map(_is_unused, self.folders)):
+            return
+        what = "another program's SQLite database"
+        try:
+            (application,) = self.peek(lambda db: db.execute("PRAGMA application_id").fetchone(), with_wal=False)
+        except sqlite3.DatabaseError as error:
+            if getattr(error, "sqlite_errorcode", 0) != sqlite3.SQLITE_NOTADB:
+                return  # The opening says what is wrong.
+            application, what = 0, "no SQLite database"
+        if application != APPLICATION:
+            raise self.refused(
+                self.path,
+                f"this is not a holdfast store, but {what}",
+                "give the store another path; or, if one was here, put all of its files back",
+            )
 
     def _look(self, part: str, *, is_folder: bool = False) -> os.stat_result | None:
         """Refuse a part that is no file (or folder) of this process's user alone; None if it is not there."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from ... import events
 from ...actors.events import (
+    REFUSED,
     TRACED,
     ActorCrashed,
     ChildRestarted,
@@ -72,7 +73,7 @@ class Tally:
                 self.refused.add("held", by=refused)
             case FrameRefused():
                 self.refused.add("frame")
-            case DeadLetter(why=why) if why.startswith("refused: "):
+            case DeadLetter(why=why) if why.startswith(REFUSED):
                 self.refused.add("message")
             case TurnSlow(seconds=seconds):
                 self.longest_slow_turn = max(self.longest_slow_turn, seconds)

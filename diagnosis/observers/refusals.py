@@ -7,7 +7,7 @@ from collections import defaultdict
 from collections.abc import Collection
 from typing import Final, NamedTuple
 
-from ...actors.events import DeadLetter
+from ...actors.events import REFUSED, DeadLetter
 from ...actors.kernel.message import Refusal
 from ...supervision.intensity import recent_restarts
 
@@ -73,7 +73,7 @@ class Refusals:
     def take_end(self, whose: str, letter: DeadLetter, now: float) -> None:
         """Nobody handles a message that one was told: perhaps because its turn was refused what it needed."""
         refused = self._last.get(whose)
-        if refused is not None and now - refused.when <= self._recent and letter.why == f"refused: {refused.error}":
+        if refused is not None and now - refused.when <= self._recent and letter.why == f"{REFUSED}{refused.error}":
             record = self._records[refused.by]
             record.ended = (*recent_restarts(record.ended, now, WITHIN), now)
 

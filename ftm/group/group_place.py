@@ -545,7 +545,7 @@ class GroupPlace(Place):
         if self._starting is not None and not self._starting.done():
             self._starting.cancel()
         else:
-            self._begin_end(cell, reason, -1, ordered=True)
+            self._begin_end(cell, reason, self.running(cell), ordered=True)
 
     def left(self, cell: Cell) -> list[asyncio.Future[Any]]:
         return [task for task in (self._ending, self._starting) if task is not None and not task.done()]
@@ -594,6 +594,8 @@ class GroupPlace(Place):
             return
         if ftm.state not in (DOWN, GONE):
             ended = ftm.ended()
+            if group is not None:
+                group.replicas.dismiss()
             ftm.kill()
             await ended
         lifecycle.retire(ftm, "the mechanism has ended")
@@ -605,6 +607,7 @@ class GroupPlace(Place):
         if ftm is not None and ftm.state is not GONE:
             if self.group is not None:
                 self.group.close("it has stopped")
+                self.group.replicas.dismiss()
             ftm.kill()
         if self.probation is not None:
             self.probation.end(is_kept=True, why=UNJUDGED)

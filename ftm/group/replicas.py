@@ -16,7 +16,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 from ...actors.errors import ActorStopped, AskFailed, AskTimeout, HoldfastError, NoSuchActor
-from ...actors.exit_reasons import KILLED, Crash, Exited, ExitReason, Hung, OutOfMemory, Shutdown, Signal, TrustBreach
+from ...actors.exit_reasons import (
+    KILLED,
+    SHUTDOWN,
+    Crash,
+    Exited,
+    ExitReason,
+    Hung,
+    OutOfMemory,
+    Shutdown,
+    Signal,
+    TrustBreach,
+)
 from ...actors.kernel.actor import Actor
 from ...actors.kernel.cell import RUNNING, Cell
 from ...actors.kernel.message import Message, message_name
@@ -412,6 +423,13 @@ class Replicas:
         else:
             worker.kill(KILLED)
             await worker.gone()
+
+    def dismiss(self) -> None:
+        """Kill the processes of all replicas, since the mechanism has ended, or is taken away: that is no fault."""
+        for name in self.membership.names:
+            worker = self.worker_of(name)
+            if worker is not None:
+                worker.kill(SHUTDOWN)
 
     async def why_ended(self, name: str, life: int, error: HoldfastError) -> str:
         """Why a replica has not done as it was told: if it has ended, it says soon of what."""

@@ -211,6 +211,9 @@ class ServerLife(Life):
         if is_last:
             self.server.last_snapshot()
 
+    def save_before_crash(self) -> None:
+        """Each replica ends at a time of its own: the points of all of them are made together."""
+
     def want_snapshot(self) -> None:
         self.server.want_snapshot()
 

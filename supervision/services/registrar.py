@@ -182,6 +182,7 @@ class Claim:
     ticket: str
     holder: Cell | None  # None: not an actor, so only it can give the lock back
     life: int
+    turn: int  # the input in whose turn a recorded actor has asked for it; -1: in none, as a hook does
     handle: ReplyHandle[Any]
 
 
@@ -391,7 +392,8 @@ class RegistryActor(Actor):
         sender = item.sender if isinstance(item, Ask) else None
         if sender is not None and not is_living(sender, message.life):
             return None
-        claim = Claim(message.key, message.ticket, sender, message.life, handle)
+        turn = item.chain[0][1] if item.chain else -1
+        claim = Claim(message.key, message.ticket, sender, message.life, turn, handle)
         waiting = self._book.locks.setdefault(message.key, deque())
         waiting.append(claim)
         if sender is not None:
@@ -449,8 +451,8 @@ class RegistryActor(Actor):
         if not recovering:
             self._drop_dead(holder, told=True)
             self._take_back(source.path)
-        elif not isinstance(holder.host, OutsideHost) and not holder.host.home.keeps_turns:
-            self._drop_claims(holder, lambda claim: True)
+        elif not isinstance(holder.host, OutsideHost):
+            self._drop_claims(holder, lambda claim: not holder.host.home.goes_on_with(claim.turn))
 
     def _drop_dead(self, holder: Cell, *, told: bool = False) -> None:
         """Free what the ended lives of an actor held; if it was `told`, a stand-in has ended whatever it looks like."""

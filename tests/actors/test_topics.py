@@ -186,3 +186,22 @@ async def test_topics_and_addresses_are_different_name_spaces(system: hf.ActorSy
     await other.ask(Do(lambda actor: actor.ctx.subscribe("/t/news")))
     await system.publish("/t/news", News(1))
     assert (await one.ask(Seen()), await other.ask(Seen())) == ([], [1])
+
+
+MIXIN = type("Mixin", (), {"news": Subscriber.news})
+
+
+@pytest.mark.parametrize("base", [Subscriber, MIXIN], ids=["an actor", "a mixin"])
+def test_what_stands_in_the_place_of_a_subscription_says_whether_it_is_one(base: type) -> None:
+    bases = (base,) if issubclass(base, hf.Actor) else (base, hf.Actor)
+
+    @hf.on(News)
+    def news(self: object, message: News) -> None: ...
+
+    says = r'Silent\.news .* subscribes.* write @subscribe\("/more"\) and @subscribe\("/news"\) above it, too'
+    with pytest.raises(TypeError, match=says):
+        type("Silent", bases, {"news": news})
+    without: Any = type("Without", bases, {"news": None, "quietly": news})
+    assert (without._topics, News in without._table) == ((), True)
+    elsewhere: Any = type("Elsewhere", bases, {"news": hf.subscribe("/elsewhere")(news)})
+    assert elsewhere._topics == ("/elsewhere",)

@@ -43,6 +43,37 @@ class Ledger(hf.Actor):
         return self.orders
 
 
+class Notice(hf.Message):
+    text: str
+
+
+class Urgent(Notice):
+    level: int
+
+
+class Alarm(Urgent):
+    siren: bool
+
+
+class Gather(hf.Message[list[str]]):
+    count: int
+
+
+class Clerk(hf.Actor):
+    """Waits for notices, whatever they are called."""
+
+    @hf.on(Gather)
+    async def gather(self, message: Gather) -> list[str]:
+        return [repr(await self.ctx.wait_for(Notice, timeout=20.0)) for _ in range(message.count)]
+
+    @hf.on(Notice)
+    def late(self, message: Notice) -> None: ...
+
+    @hf.on(Urgent)
+    def late_and_urgent(self, message: Urgent) -> None: ...
+
+
+NOTICES = (Urgent("rain", 2), Notice("sun"), Alarm("flood", 9, True))
 ORDERS = (Order(1), Express(2, "air"), Overnight(3, "road", 8))
 
 

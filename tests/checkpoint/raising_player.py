@@ -1,7 +1,8 @@
-"""A root with a SQLite store for `test_restart_root.py`: python raising_player.py STORE LIFE.
+"""A root with a SQLite store for `test_restart_root.py`: python raising_player.py STORE LIFE HOW.
 
 LIFE "first": each actor has a message in hand and another one waits, and the process ends by SIGKILL. LIFE "second":
-the handlers raise when they are run again; what became of each actor is printed.
+the handlers raise when they are run again (HOW "raises"), or kill their own process, once (HOW "kills", which is for
+actors in other processes alone); what became of each actor is printed.
 """
 
 from __future__ import annotations
@@ -15,11 +16,15 @@ from pathlib import Path
 
 import holdfast as hf
 
-PLACES = ("/app/task", "/app/process", "/app/here/below", "/app/there/below")
+PLACES = {
+    "raises": ("/app/task", "/app/process", "/app/here/below", "/app/there/below"),
+    "kills": ("/app/process", "/app/there/below"),
+}
 
 
 class Hand(hf.Message):
     marker: str
+    how: str
 
 
 class Ping(hf.Message): ...
@@ -29,17 +34,22 @@ class Seen(hf.Message[int]): ...
 
 
 class Raises(hf.Actor):
-    """Holds what it is handed as long as its program lives; raises if that is over."""
+    """Holds what it is handed as long as its program lives; raises if that is over, or kills its process once."""
 
     def __init__(self) -> None:
         self.pings = 0
 
     @hf.on(Hand)
     async def hold(self, message: Hand) -> None:
-        if Path(message.marker).exists():
+        marker, killed = Path(message.marker), Path(f"{message.marker}.killed")
+        if not marker.exists():
+            marker.touch()
+            await asyncio.Event().wait()
+        if message.how == "raises":
             raise ValueError("not again")
-        Path(message.marker).touch()
-        await asyncio.Event().wait()
+        if not killed.exists():
+            killed.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
 
     @hf.on(Ping)
     def ping(self, message: Ping) -> None:
@@ -50,19 +60,20 @@ class Raises(hf.Actor):
         return self.pings
 
 
-async def main(store: str, life: str) -> None:
+async def main(store: str, life: str, how: str) -> None:
+    places = PLACES[how]
     below = hf.child("below", hf.start(Raises), recovery=hf.hybrid())
-    async with hf.ActorSystem("app", store=f"sqlite:{store}", log=False, intensity=len(PLACES)) as system:
+    async with hf.ActorSystem("app", store=f"sqlite:{store}", log=False, intensity=len(places)) as system:
         with system.events() as events:
             await system.start(hf.child("task", hf.start(Raises), recovery=hf.hybrid()))
             await system.start(hf.child("process", hf.start(Raises), recovery=hf.hybrid(), isolation="process"))
             await system.start(hf.supervisor("here", children=[below]))
             await system.start(hf.supervisor("there", children=[below], isolation="process"))
-            refs = [system.ref(path, Raises) for path in PLACES]
+            refs = [system.ref(path, Raises) for path in places]
             if life == "first":
                 markers = [Path(f"{store}.{number}") for number in range(len(refs))]
                 for ref, marker in zip(refs, markers, strict=True):
-                    await ref.send(Hand(str(marker)))
+                    await ref.send(Hand(str(marker), how))
                     await ref.send(Ping())
                 while not all(marker.exists() for marker in markers):
                     await asyncio.sleep(0)

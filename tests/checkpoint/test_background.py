@@ -107,6 +107,69 @@ async def test_work_that_ends_without_a_message_crashes_the_actor_once(
             await system.checkpoint(worker, timeout=30.0)
 
 
+class Busy(hf.Actor):
+    """Begins a background task that raises, in a turn that is over before it does, or only behind it."""
+
+    def __init__(self) -> None:
+        self.begun: list[str] = []
+
+    async def _fail(self) -> None:
+        await asyncio.sleep(0)
+        raise OSError("no luck")
+
+    @hf.on(Begin)
+    async def begin(self, message: Begin) -> None:
+        self.begun.append(message.how)
+        task = self.ctx.create_task(self._fail())
+        if message.how == "within":
+            await asyncio.wait([task])
+
+    @hf.on(Lives, readonly=True)
+    def lives(self, message: Lives) -> tuple[int, list[str]]:
+        return self.ctx.life, self.begun
+
+
+@pytest.mark.parametrize("how", ["within", "behind"])
+async def test_a_task_that_raises_ends_one_life_of_a_recorded_actor(how: str, isolation: str) -> None:
+    """A replay of the turn that has begun it would begin it again, and end each life."""
+    async with hf.ActorSystem("app", log=False, intensity=1000) as system:
+        busy = await start(system, isolation, "busy", hf.start(Busy), recovery=hf.hybrid(interval=3600.0))
+        with system.events() as stream:
+            busy.tell(Begin(how))
+            async with asyncio.timeout(30.0):
+                async for event in stream:
+                    if isinstance(event, hf.events.ActorCrashed):
+                        break
+        assert await busy.ask(Lives(), timeout=30.0) == (2, [how])
+        await system.checkpoint(busy, timeout=30.0)
+        assert await busy.ask(Lives(), timeout=30.0) == (2, [how])
+
+
+class Late(Busy):
+    """As `Busy`, but its first life is killed before the task has raised."""
+
+    async def _fail(self) -> None:
+        if self.ctx.life == 1:
+            await asyncio.get_running_loop().create_future()
+        await super()._fail()
+
+
+async def test_a_task_that_a_replay_has_begun_ends_no_replay(isolation: str) -> None:
+    """That comes to its end, and is saved, before the life ends by the task: else none would ever be over."""
+    async with hf.ActorSystem("app", log=False, intensity=1000) as system:
+        recovery = hf.hybrid(interval=3600.0, pacing="original")  # The task has raised when the next input is due.
+        late = await start(system, isolation, "late", hf.start(Late), recovery=recovery)
+        begun = ["0", "1", "2"]
+        for how in begun:
+            await late.ask(Begin(how), timeout=30.0)
+        with system.events() as stream:
+            late.kill()
+            async with asyncio.timeout(30.0):
+                while (await late.ask(Lives(), timeout=30.0)) != (3, begun):
+                    await asyncio.sleep(0)
+            assert not [event for event in stream.take() if isinstance(event, hf.events.RecoveryFailed)]
+
+
 async def test_cancelled_work_is_a_failure_that_can_be_taken(method: hf.Method | None, isolation: str) -> None:
     async with hf.ActorSystem("app", log=False) as system:
         worker = await start(system, isolation, "worker", hf.start(Worker), recovery=method)

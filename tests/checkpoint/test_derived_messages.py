@@ -9,7 +9,7 @@ import pytest
 
 import holdfast as hf
 from tests.checkpoint import derived_player
-from tests.checkpoint.derived_player import ORDERS, Express, Ledger, Show
+from tests.checkpoint.derived_player import NOTICES, ORDERS, Clerk, Express, Gather, Ledger, Show
 from tests.launched import kills_itself, python
 
 pytestmark = pytest.mark.usefixtures("warm_programs")
@@ -35,6 +35,25 @@ async def test_what_derives_is_handled(place: str) -> None:
         ledger.tell(ORDERS[1])
         await ledger.send(ORDERS[2])
         assert await ledger.ask(Show()) == [*SHOWN, *SHOWN[1:]]
+
+
+@pytest.mark.parametrize("when", ["before", "meanwhile"])
+@pytest.mark.parametrize("place", [place for place, options in PLACES.items() if "recovery" in options])
+async def test_what_derives_is_waited_for(place: str, when: str) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        clerk = await system.start(hf.child("clerk", hf.start(Clerk), **PLACES[place]))
+        gathered = asyncio.ensure_future(clerk.ask(Gather(len(NOTICES)), timeout=60.0))
+        await system.get_status(clerk)  # Behind the ask.
+        if when == "before":  # The clerk comes to them one after another.
+            for notice in NOTICES:
+                clerk.tell(notice)
+        else:
+            for notice in NOTICES:
+                while "wait_for" not in (await system.get_status(clerk)).turn_at:
+                    await asyncio.sleep(0)
+                await clerk.ask(notice, timeout=60.0)
+                clerk.kill()
+        assert await gathered == [repr(notice) for notice in NOTICES]
 
 
 @pytest.mark.parametrize("isolation", ["task", "process"])

@@ -93,3 +93,25 @@ async def test_what_waits_stays(how: str, isolation: str, tmp_path: Path) -> Non
         await approve(ref, system, 2)
         await approve(ref, system, 3)
         assert await ref.ask(Look(), timeout=30.0) == ["lamp", "chair", "table"]
+
+
+@pytest.mark.parametrize("how", ["init", "on_start"])
+@pytest.mark.parametrize("place", ["task", "process", "subtree", "process in a subtree", "pbr", "pbr in a subtree"])
+async def test_a_first_start_that_fails_is_no_recovery(how: str, place: str) -> None:
+    options: dict[str, Any] = {"isolation": "process"} if place.startswith("process") else {}
+    if place.startswith("pbr"):
+        options = {"mechanism": hf.ftm.PBR()}
+    async with hf.ActorSystem("app", log=False) as system:
+        above = await system.start(hf.supervisor("above", isolation="process" if "subtree" in place else "task"))
+        with system.events() as stream:
+            child = hf.child("flow", hf.start(Flow, how), recovery=hf.hybrid(), **options)
+            with pytest.raises(hf.StartFailed, match=f"no luck in {how}"):
+                await above.ask(hf.StartChild(child), timeout=30.0)
+            well = hf.child("flow", hf.start(Flow, "well"), recovery=hf.hybrid(), **options)
+            flow = await above.ask(hf.StartChild(well), timeout=30.0)
+            flow.kill()
+            phases = [await stream.until(hf.events.RecoveryPhase, timeout=30.0)]
+            while phases[-1].phase != "release":
+                phases.append(await stream.until(hf.events.RecoveryPhase, timeout=30.0))
+            assert [(one.recovery, one.phase) for one in phases].count((1, "detect")) == 1
+            assert {one.recovery for one in phases} == {1}

@@ -25,6 +25,7 @@ KILLING = "tests/checkpoint/test_killing_steps.py"
 
 SMALL_DISK = "tests/checkpoint/sqlite/test_small_disk.py"
 CLOCKS_SET = "tests/effects/test_clocks_set.py"
+BACKGROUND = "tests/checkpoint/test_background.py"
 BETWEEN = "tests/checkpoint/test_between_lives.py"
 TIES = "tests/checkpoint/test_ties_of_an_address.py"
 ORDER = "tests/checkpoint/test_order.py"
@@ -39,6 +40,97 @@ GIVEN_UP = "tests/checkpoint/test_given_up.py"
 WITHDRAWN = "tests/checkpoint/test_withdrawn.py"
 
 CHECKS = {
+    "what derives from a message that a turn waits for is taken": Check(
+        "checkpoint/long_waits.py",
+        "        return any(message_name(base) in wanted for base in kind.__mro__)",
+        "        return False",
+        "tests/checkpoint/test_derived_messages.py",
+        "test_what_derives_is_waited_for and before and recorded and not process",
+    ),
+    "what derives from a message that a turn waits for is read as what it is": Check(
+        "checkpoint/life/recorded_life.py",
+        "decode(kind or self.cell.table.kind_named(answer.name), answer.body)",
+        "decode(kind or next(iter(awaited)), answer.body)",
+        "tests/checkpoint/test_derived_messages.py",
+        "test_what_derives_is_waited_for and before and recorded and not process",
+    ),
+    "a first start that fails is no recovery": Check(
+        "checkpoint/home/journal_home.py",
+        "        if recovers and has_begun:",
+        "        if recovers:",
+        "tests/checkpoint/test_failed_starts.py",
+        "test_a_first_start_that_fails and subtree",
+    ),
+    "a file of somebody else is no damaged store": Check(
+        "checkpoint/sqlite/store_parts.py",
+        "            self._refuse_stranger()\n",
+        "",
+        "tests/checkpoint/sqlite/test_damage.py",
+        "test_another_file_is_refused",
+    ),
+    "a damaged store is no file of somebody else": Check(
+        "checkpoint/sqlite/store_parts.py",
+        "        if not all(map(_is_unused, self.folders)):\n            return\n",
+        "",
+        "tests/checkpoint/sqlite/test_damage.py",
+        "test_a_store_of_which_the_header",
+    ),
+    "an empty file is left alone": Check(
+        "checkpoint/sqlite/open_store.py",
+        "        if is_there and os.path.getsize(self.path) == 0:",
+        "        if False:",
+        "tests/checkpoint/sqlite/test_damage.py",
+        "test_an_empty_file",
+    ),
+    "a recorded actor hears of the end of its own child in a turn": Check(
+        "checkpoint/life/recorded_life.py",
+        "        if not isinstance(item, (links.Exit, links.Down)):\n            super().push(cell, item)",
+        "        if True:\n            super().push(cell, item)",
+        TIES,
+        "test_the_end_of_a_child_in_the_same_process",
+    ),
+    "a supervisor whose process has died begins without a child, and nobody waits for that": Check(
+        "checkpoint/home/homes.py",
+        "                switch.cell.host.parent.begins_without(switch.cell)\n",
+        "                pass\n",
+        "tests/checkpoint/test_subtree.py",
+        "test_who_asks_a_child_that_nobody_starts_again and supervisor-process",
+    ),
+    "what was in hand of a child at the root is known before its address is given up": Check(
+        "checkpoint/places/far_parent.py",
+        "        left = self._left()\n        if left:  # Else who",
+        "        left = []\n        if left:  # Else who",
+        "tests/checkpoint/test_subtree.py",
+        "test_who_asks_a_child_that_nobody_starts_again and pbr-process",
+    ),
+    "what was in hand behind a mechanism is known when its life is ended": Check(
+        "ftm/group/group_place.py",
+        "self._begin_end(cell, reason, self.running(cell), ordered=True)",
+        "self._begin_end(cell, reason, -1, ordered=True)",
+        "tests/checkpoint/test_subtree.py",
+        "test_who_asks_a_child_that_nobody_starts_again and pbr-process",
+    ),
+    "a turn that ends the process of a supervisor which still starts is no failed start": Check(
+        "actors/process/process_host.py",
+        "            if self.has_ended_in_turn:\n                return  # That",
+        "            if False:\n                return  # That",
+        "tests/checkpoint/test_restart_root.py",
+        "test_a_turn_that_kills_its_process_when_it_is_run_again",
+    ),
+    "a task that has raised is not begun again by a replay": Check(
+        "checkpoint/life/recorded_life.py",
+        "            self.take_snapshot(is_last=True)\n\n    def last_snapshot",
+        "            return\n\n    def last_snapshot",
+        BACKGROUND,
+        "test_a_task_that_raises_ends_one_life_of_a_recorded_actor",
+    ),
+    "a task that raises in a replay waits for its end": Check(
+        "checkpoint/life/recorded_life.py",
+        "        if self.is_live:\n            self.cell.push(failed)",
+        "        if True:\n            self.cell.push(failed)",
+        BACKGROUND,
+        "test_a_task_that_a_replay_has_begun_ends_no_replay",
+    ),
     "what a home knows of a turn is known of one behind a mechanism, too": Check(
         "system/controls.py",
         "there, names = known_at_home(told, cell), (",
@@ -279,7 +371,7 @@ CHECKS = {
     ),
     "a lock of a turn that nobody goes on with is free": Check(
         "supervision/services/registrar.py",
-        "            self._drop_claims(holder, lambda claim: True)\n",
+        "            self._drop_claims(holder, lambda claim: not holder.host.home.goes_on_with(claim.turn))\n",
         "            pass\n",
         REGISTRY_PROTECTED,
         "over_a_kill and checkpoint_only",
@@ -291,10 +383,17 @@ CHECKS = {
         REGISTRY_PROTECTED,
         "over_a_kill and hybrid-process and not pbr",
     ),
+    "a lock of a turn that is put aside is free": Check(
+        "checkpoint/home/journal_home.py",
+        "self.keeps_turns and self.switch is not None and key in self.switch.open",
+        "self.keeps_turns",
+        REGISTRY_PROTECTED,
+        "put_aside and hybrid-process or put_aside and pbr",
+    ),
     "a lock of a turn that is gone on with is kept": Check(
         "supervision/services/registrar.py",
-        " and not holder.host.home.keeps_turns:",
-        ":",
+        "lambda claim: not holder.host.home.goes_on_with(claim.turn)",
+        "lambda claim: True",
         REGISTRY_PROTECTED,
         "over_a_kill and hybrid and not pbr and not process",
     ),

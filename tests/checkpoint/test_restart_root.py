@@ -53,13 +53,25 @@ def test_all_that_was_accepted_is_there_once_after_kills_of_the_root(tmp_path: P
     assert set(first) <= accepted | unsure
 
 
-def test_a_turn_that_raises_when_it_is_run_again_is_a_crash_and_no_failed_start(tmp_path: Path) -> None:
+def run_again(store: Path, how: str) -> tuple[list[int], list[str], list[str]]:
+    """What becomes of actors whose turns in hand raise, or kill, when the next program runs them again."""
     script = Path(__file__).with_name("raising_player.py")
     environment = {**os.environ, "PYTHONPATH": PATHS}
     for life, code in (("first", -9), ("second", 0)):
-        command = [sys.executable, str(script), str(tmp_path / "app.db"), life]
+        command = [sys.executable, str(script), str(store), life, how]
         ended = subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment)
         assert ended.returncode == code, ended.stderr
     pings, crashed, restarted = json.loads(ended.stdout)
+    return pings, crashed, restarted
+
+
+def test_a_turn_that_raises_when_it_is_run_again_is_a_crash_and_no_failed_start(tmp_path: Path) -> None:
+    pings, crashed, restarted = run_again(tmp_path / "app.db", "raises")
     assert pings == [1, 1, 1, 1], "what waited behind it was lost"
     assert crashed == restarted == ["/app/here/below", "/app/process", "/app/task", "/app/there/below"]
+
+
+def test_a_turn_that_kills_its_process_when_it_is_run_again_is_no_failed_start(tmp_path: Path) -> None:
+    pings, _, restarted = run_again(tmp_path / "app.db", "kills")
+    assert pings == [1, 1], "what waited behind it was lost"
+    assert restarted == ["/app/process", "/app/there"]

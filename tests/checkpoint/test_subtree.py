@@ -232,3 +232,51 @@ async def test_nothing_is_lost_or_doubled_however_the_process_dies(system: hf.Ac
 def at_any(system: hf.ActorSystem, name: str) -> hf.ActorRef[Any]:
     """By address, also while nobody lives there."""
     return system._node.cell_at(f"/app/team/{name}").ref
+
+
+@pytest.mark.parametrize("above", ["task", "process"])
+@pytest.mark.parametrize("own", ["with its supervisor", "own process", "pbr"])
+async def test_who_asks_a_child_that_nobody_starts_again_does_not_wait_for_it(
+    system: hf.ActorSystem, above: Any, own: str, tmp_path: Path
+) -> None:
+    """A dynamic supervisor without a journal begins without its children; somebody may start that id again."""
+    places: dict[str, dict[str, Any]] = {
+        "with its supervisor": {},
+        "own process": {"isolation": "process"},
+        "pbr": {"mechanism": hf.ftm.PBR()},
+    }
+    template = hf.child(None, hf.start(Doer), recovery=hf.hybrid(interval=NEVER), **places[own])
+    await system.start(hf.supervisor("team", children=[hf.dynamic("crowd", template=template)], isolation=above))
+    crowd = at(system, "crowd", hf.Supervisor)
+
+    async def come() -> None:
+        await crowd.ask(hf.StartChild(id="a"), timeout=30.0)
+
+    async def go() -> None:
+        """The supervisors end, and are there again."""
+        if above == "process":
+            kill_process(system)
+        else:
+            system.ref("/app/team", hf.Supervisor).kill()
+        async with asyncio.timeout(30.0):
+            while True:
+                with contextlib.suppress(hf.HoldfastError):
+                    if await crowd.ask(hf.WhichChildren(), timeout=30.0) == []:
+                        return
+                await asyncio.sleep(0)
+
+    await come()
+    someone = at(system, "crowd/a")
+    await someone.ask(Note("kept"))
+    asking = asyncio.ensure_future(someone.ask(Do([f"gate {tmp_path}/gate"]), timeout=60.0))
+    await until((tmp_path / "gate").exists)
+    for number in range(2):
+        await go()
+        with pytest.raises(hf.ActorStopped, match="may start it again"):
+            await someone.ask(Seen(), timeout=60.0)
+        someone.tell(Note(f"told {number}"))
+    with pytest.raises(hf.AskFailed):
+        await asking
+    (tmp_path / "gate.open").touch()
+    await come()
+    assert (await someone.ask(Seen(), timeout=30.0))[-2:] == ["told 0", "told 1"]

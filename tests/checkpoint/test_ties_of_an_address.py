@@ -9,6 +9,7 @@ import pytest
 
 import holdfast as hf
 from holdfast.actors.kernel.cell import DOWN, GONE
+from tests.checkpoint.players import start
 
 
 class Tie(hf.Message):
@@ -184,3 +185,59 @@ async def test_who_links_with_one_between_two_lives_is_linked_with_the_next(
     async with asyncio.timeout(20.0):
         while await other.ask(Told()) != ["EXIT /app/above/linked"]:
             pass
+
+
+class Raise(hf.Message):
+    """Have a child that ends, and is tied in this way."""
+
+    how: str
+
+
+class End(hf.Message): ...
+
+
+class Child(hf.Actor):
+    @hf.on(End)
+    def end(self, message: End) -> None:
+        self.ctx.stop()
+
+
+class Parent(hf.Actor):
+    def __init__(self) -> None:
+        self.told: list[str] = []
+
+    @hf.on(Raise)
+    def have_child(self, message: Raise) -> None:
+        child = self.ctx.spawn(hf.start(Child))
+        if message.how == "link":
+            self.ctx.trap_exits = True
+            self.ctx.link(child)
+        else:
+            (self.ctx.monitor if message.how == "monitor" else self.ctx.watch)(child)
+        child.tell(End())
+
+    @hf.on(Told, readonly=True)
+    def read(self, message: Told) -> list[str]:
+        return self.told
+
+    def on_down(self, source: hf.ActorRef[Any], reason: hf.ExitReason, recovering: bool) -> None:
+        self.told.append("DOWN")
+
+    def on_exit(self, source: hf.ActorRef[Any], reason: hf.ExitReason) -> None:
+        self.told.append("EXIT")
+
+
+@pytest.mark.parametrize("how", ["monitor", "watch", "link"])
+async def test_the_end_of_a_child_in_the_same_process_is_heard_of_once(
+    system: hf.ActorSystem, isolation: str, how: str
+) -> None:
+    parent = await start(system, isolation, "parent", hf.start(Parent), recovery=hf.hybrid())
+    await parent.ask(Raise(how))
+    heard = ["EXIT" if how == "link" else "DOWN"]
+    async with asyncio.timeout(30.0):
+        while await parent.ask(Told()) == []:
+            await asyncio.sleep(0)
+    await system.checkpoint(parent)
+    assert await parent.ask(Told()) == heard
+    parent.kill()
+    assert await parent.ask(Told(), timeout=30.0) == heard

@@ -20,6 +20,13 @@ FAILOVER, CHECKS_ALONE = "tests/ftm/test_failover.py", "tests/ftm/test_checks.py
 AUTHORS = "tests/ftm/test_author_bricks.py"
 REVOKED, LINKS = "tests/ftm/test_revoked_replicas.py", "tests/ftm/sec/test_link.py"
 CHECKS = {
+    "the end of a replica that is not wanted any more is no fault": Check(
+        "ftm/group/group_place.py",
+        "                group.replicas.dismiss()\n",
+        "                pass\n",
+        "tests/system/test_logs.py",
+        "test_replicas_that_are_not_wanted",
+    ),
     "a process speaks for the actor whose replica it is, and for no other": Check(
         "actors/process/wire/worker_gate.py",
         "        return self._node.cell_at(path).living.path in self._voices()\n",

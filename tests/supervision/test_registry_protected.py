@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -53,6 +54,7 @@ class Doorkeeper(hf.Actor):
 
 class Work(hf.Message):
     crashes: str = ""
+    begun: str = ""  # a file, to which each life adds a letter when it is in the block, and waits there
 
 
 class Count(hf.Message[int]): ...
@@ -73,6 +75,10 @@ class Locker(hf.Actor):
         async with Registry[str, None](self.names).lock("k"):
             if message.crashes == "inside":
                 raise RuntimeError("in the block")
+            if message.begun:
+                with Path(message.begun).open("a") as file:
+                    file.write("x")
+                await asyncio.Event().wait()
             if not message.crashes:
                 await self.door.ask(Enter(), timeout=60.0)
         if message.crashes:
@@ -130,6 +136,22 @@ async def test_a_lock_is_kept_over_a_kill_only_where_the_turn_goes_on(place: str
         async with names.lock("k"):
             with pytest.raises(hf.errors.AskFailed):
                 await working
+
+
+@pytest.mark.parametrize("place", GOES_ON)
+async def test_a_lock_of_a_turn_that_is_put_aside_is_free(place: str, tmp_path: Path) -> None:
+    begun = tmp_path / "begun"
+    begun.touch()
+    async with hf.ActorSystem("app", log=False, intensity=100) as system:
+        locker, names, _ = await open_house(system, place)
+        working = asyncio.ensure_future(locker.ask(Work(begun=str(begun)), timeout=60.0))
+        for times in (1, 2, 3):
+            await until(lambda times=times: begun.read_text() == "x" * times)
+            locker.kill()
+        async with names.lock("k"):
+            with pytest.raises(hf.Quarantined):
+                await working
+            assert await locker.ask(Count(), timeout=60.0) == 1
 
 
 @pytest.mark.parametrize("how", ["crash", "kill"])

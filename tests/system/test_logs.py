@@ -361,3 +361,20 @@ async def test_siblings_that_recover_together_have_one_record_also_at_the_end(re
             await ref.ask(Ping())
     (together,) = of(records, "actors recovered")
     assert (together["address"], together["actors"], together["log_level"]) == ("/app", 3, "info")
+
+
+@pytest.mark.asyncio(loop_factories=["uvloop"])
+@pytest.mark.parametrize("how", ["taken away", "stopped"])
+async def test_replicas_that_are_not_wanted_any_more_do_not_die(records: list[Record], how: str) -> None:
+    async with hf.ActorSystem("shop") as system:
+        ref = await system.start(hf.child("silent", hf.start(Silent), mechanism=hf.ftm.PBR()))
+        with system.events() as events:
+            if how == "stopped":
+                await system.stop(ref)
+            else:
+                async with system.transaction() as change:
+                    change.protect(ref, None)
+                assert await ref.ask(Ping()) == "pong"
+            ended = [await events.until(hf.events.ProcessDied) for _ in range(2)]
+    assert [str(event.reason) for event in ended] == ["shutdown", "shutdown"]
+    assert not [record for record in records if record["log_level"] in ("warning", "error")]

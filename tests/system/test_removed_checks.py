@@ -131,6 +131,13 @@ CHECKS = {
         "tests/checkpoint/test_derived_messages.py",
         "is_handled_is_refused and protected",
     ),
+    "what stands in the place of a handler that subscribes does so": Check(
+        "actors/kernel/actor.py",
+        "            if marks and not subscribed and heard.get(name):",
+        "            if False:",
+        "tests/actors/test_topics.py",
+        "test_what_stands_in_the_place_of_a_subscription",
+    ),
     "what stands in the place of a handler is one": Check(
         "actors/kernel/actor.py",
         "            if not marks and name in marked and members[name] is not None:\n",

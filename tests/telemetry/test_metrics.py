@@ -19,7 +19,7 @@ from holdfast.console.telemetry.families import FAMILIES
 from holdfast.console.telemetry.metrics import Metrics
 from holdfast.console.telemetry.series import Labels, Spread
 from tests.telemetry.scrapes import Scrape, scraped, until
-from tests.telemetry.shop import Account, Add, Boom, Deny
+from tests.telemetry.shop import Account, Add, Boom, Careless, Deny, Hire, Waste
 
 DOCS = Path(__file__).parents[2] / "docs" / "metrics-and-traces.md"
 
@@ -75,6 +75,26 @@ async def test_crashes_refusals_and_letters_are_counted() -> None:
         assert found.value("holdfast_restarts_total", supervisor="/app", reason="Crash") == 1
         assert found.value("holdfast_refused_total", what="message") == 1
         assert found.value("holdfast_dead_letters_total") == 1
+
+
+@pytest.mark.parametrize("recovery", [None, hf.hybrid()], ids=["plain", "recorded"])
+@pytest.mark.parametrize("place", ["task", "process", "subtree", "pbr", "lfr"])
+async def test_letters_are_counted_once_wherever_they_become_dead(place: str, recovery: Any) -> None:
+    """Also in a storm, of which the history and the log tell but a part."""
+    protected = {"pbr": hf.ftm.PBR(), "lfr": hf.ftm.LFR()}
+    own: dict[str, Any] = {"isolation": "process"} if place == "process" else {}
+    careless = hf.child("one", hf.start(Careless), recovery=recovery, mechanism=protected.get(place), **own)
+    async with hf.ActorSystem("app", log=False) as system:
+        metrics = Metrics(system)
+        above = hf.supervisor("above", children=[careless], isolation="process" if place == "subtree" else "task")
+        await system.start(above)
+        one = system.ref("/app/above/one", Careless)
+        await one.ask(Hire(), timeout=30.0)
+        for _ in range(3):
+            await one.ask(Waste(1_000), timeout=30.0)
+        await one.ask(Hire(), timeout=30.0)  # Behind all that it has told itself.
+        assert system.dead_letters == 3_000
+        assert (await scraped(metrics)).value("holdfast_dead_letters_total") == 3_000
 
 
 @pytest.mark.parametrize("recovery", [None, hf.hybrid()])

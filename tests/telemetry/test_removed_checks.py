@@ -12,6 +12,20 @@ METRICS = "tests/telemetry/test_metrics.py"
 TRACES = "tests/telemetry/test_traces.py"
 
 CHECKS = {
+    "what became a dead letter in another process is counted": Check(
+        "actors/process/worker_pool.py",
+        "            self.node.numbers.dead_letters += 1\n",
+        "            pass\n",
+        METRICS,
+        "test_letters_are_counted_once and subtree",
+    ),
+    "what was refused in another process is no dead letter": Check(
+        "actors/process/worker_pool.py",
+        "isinstance(event, DeadLetter) and not event.why.startswith(REFUSED)",
+        "isinstance(event, DeadLetter)",
+        METRICS,
+        "test_letters_are_counted_once and subtree",
+    ),
     "a tracer that raises when a span ends hurts no actor": Check(
         "actors/control/spans.py",
         "        span.end(at)\n    except Exception as error:\n",

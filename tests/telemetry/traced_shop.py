@@ -187,6 +187,7 @@ class Clerk(hf.Actor):
 class Stored(Clerk):
     """One whose state says nothing of spans."""
 
+    @hf.subscribe("/notes")
     @hf.on(Note)
     def note(self, message: Note) -> None:
         self.count += 1

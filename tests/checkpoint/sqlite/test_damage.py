@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import random
 import shutil
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+import holdfast as hf
 from holdfast.checkpoint.journal import (
     DamagedStore,
     ForeignStore,
@@ -18,6 +20,7 @@ from holdfast.checkpoint.journal import (
     StoreFailed,
 )
 from holdfast.checkpoint.sqlite import SqliteJournal
+from holdfast.checkpoint.store_tools.verification import verify_store
 from tests.checkpoint.sqlite.stores import A, B, edit, end, flip, inputs, line, made, numbers, reopened, spawn
 
 
@@ -171,15 +174,44 @@ def test_a_truncated_file_is_refused(filled: Path, size: int) -> None:
         contents(filled)
 
 
-def test_another_file_is_refused_and_left_alone(path: Path) -> None:
-    edit(path, "CREATE TABLE mine(x)")
-    before = path.read_bytes()
-    with pytest.raises(DamagedStore, match="not a holdfast store"):
+def everything(folder: Path) -> dict[str, bytes]:
+    """What lies in a folder."""
+    return {file.name: file.read_bytes() for file in folder.iterdir()}
+
+
+@pytest.mark.parametrize("what", ["database", "open database", "text", "short text"])
+async def test_another_file_is_refused_and_left_alone(path: Path, what: str) -> None:
+    with contextlib.ExitStack() as stack:
+        if what == "open database":
+            db = stack.enter_context(closing(sqlite3.connect(path)))
+            db.execute("PRAGMA journal_mode = WAL")
+            db.execute("CREATE TABLE mine(x)")
+            db.execute("BEGIN IMMEDIATE")
+        elif what == "database":
+            edit(path, "CREATE TABLE mine(x)")
+        else:
+            path.write_text("some text " * (1000 if what == "text" else 1))
+        before = everything(path.parent)
+        with pytest.raises(ForeignStore, match=r"this is not a holdfast store, but .*; give the store another path"):
+            async with hf.ActorSystem("app", store=f"sqlite:{path}", log=False):
+                raise AssertionError("it has begun")
+        with pytest.raises(ForeignStore, match="not a holdfast store"):
+            verify_store(path)
+        assert everything(path.parent) == before
+
+
+def test_an_empty_file_is_refused_and_left_alone(path: Path) -> None:
+    path.touch()
+    with pytest.raises(DamagedStore, match="the file is empty"):
         SqliteJournal(path)
-    path.with_name("text").write_text("some text " * 1000)
-    with pytest.raises(DamagedStore):
-        SqliteJournal(path.with_name("text"))
-    assert path.read_bytes() == before
+    assert everything(path.parent) == {path.name: b""}
+
+
+def test_a_store_of_which_the_header_is_damaged_is_no_other_file(filled: Path) -> None:
+    """Its folders lie beside it."""
+    edit(filled, "PRAGMA application_id = 7")
+    with pytest.raises(DamagedStore, match="not a holdfast store"):
+        SqliteJournal(filled)
 
 
 def killed(path: Path) -> bytes:
