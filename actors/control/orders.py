@@ -175,11 +175,8 @@ def has_become(cell: Cell, old: type[Actor], start: Start[Any]) -> bytes | None:
     cell.table = new._table
     if cell.more is not None and cell.more.tap is not None:
         cell.more.tap.attach()
-    for topic in old._topics:
-        if topic not in new._topics:
-            cell.node.topics.unsubscribe(topic, cell)
-    for topic in new._topics:
-        cell.node.topics.subscribe(topic, cell)
+    assert cell.ctx is not None
+    cell.ctx._has_class(old, new)
     lifecycle.limit_turns(cell)
     cell.node.ports.respec(cell, start)
     return None if cell.node.ports.uplink is None else pack_recipe(start, cell.path)
