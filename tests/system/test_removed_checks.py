@@ -2143,6 +2143,13 @@ CHECKS = {
         "tests/supervision/test_dynamic.py",
         "test_arguments_from_a_process_that_lies",
     ),
+    "what a transaction has tried of an actor is not overtaken by an order": Check(
+        "actors/control/orders_lane.py",
+        "if call.order.is_behind_transactions and",
+        "if False and",
+        "tests/system/test_held_meanwhile.py",
+        "test_a_state_that_is_replaced_while",
+    ),
 }
 
 test_the_table_is_true, test_without_the_check_a_test_fails = as_tests(CHECKS)
