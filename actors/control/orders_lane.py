@@ -258,7 +258,8 @@ def obey_order(guest: Guest, cell: Cell, frame: frames.Command) -> None:
     deadline = guest.node.loop.time() + left
     ask = RelayedAsk(ORDERED, None, (), left, deadline, None, cell, False, guest, key)
     if cell.is_dead:
-        ask.fail(lifecycle.nobody_at(cell))
+        if cell is not guest.node.root:  # Else the root hears that this life is over, and tells whoever waits.
+            ask.fail(lifecycle.nobody_at(cell))
         return
     beside = {"status": status_of, "turns": turns_of}.get(str(verb))
     if beside is not None:

@@ -2150,6 +2150,13 @@ CHECKS = {
         "tests/system/test_held_meanwhile.py",
         "test_a_state_that_is_replaced_while",
     ),
+    "a process does not say that nobody lives at the address of its own actor": Check(
+        "actors/control/orders_lane.py",
+        "        if cell is not guest.node.root:",
+        "        if True:",
+        "tests/control/test_restarting.py",
+        "test_an_order_to_an_actor_that_comes_back",
+    ),
 }
 
 test_the_table_is_true, test_without_the_check_a_test_fails = as_tests(CHECKS)
