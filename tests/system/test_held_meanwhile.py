@@ -118,7 +118,7 @@ async def test_who_is_at_rest_goes_on_while_another_one_is_restarted(
 async def test_a_state_that_is_replaced_while_the_actor_is_held_is_replaced_behind_that(
     system: hf.ActorSystem, isolation: Any, recovery: Any, fails: bool
 ) -> None:
-    """The transaction puts in force what it has tried: what came in between would be gone, though it was acknowledged."""
+    """The transaction puts in force what it has tried: what came in between would be gone, and was acknowledged."""
     one = await system.start(hf.child("one", hf.start(Counter, 5), isolation=isolation, recovery=recovery))
     given: list[asyncio.Future[Any]] = []
 
