@@ -43,7 +43,7 @@ class Order:
     is_change: ClassVar[bool] = False
     """Whether turns are not run behind it as they would have been: it is not obeyed ahead of one that had begun."""
     is_behind_transactions: ClassVar[bool] = False
-    """Whether it is obeyed behind a transaction that holds the actor, and has tried its own change on the state before."""
+    """Whether it is obeyed behind a transaction that holds the actor, which has tried its own change before."""
 
     def run(self, cell: Cell, actor: Actor) -> Any:
         """Carry it out; raises ControlFailed."""
