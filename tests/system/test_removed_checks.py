@@ -775,6 +775,13 @@ CHECKS = {
         FAR,
         "test_who_is_on_its_way and plain",
     ),
+    "nobody has another address on its way to live elsewhere": Check(
+        "system/transaction/reparenting.py",
+        "system._moves.is_moving(cell):",
+        "False:",
+        FAR,
+        "test_who_is_on_its_way_to_live_elsewhere_keeps",
+    ),
     "a change whose turn it is not yet is given up": Check(
         "system/live_moves.py",
         "            gate.on_closed(give_up)\n",
