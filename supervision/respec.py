@@ -37,6 +37,7 @@ def respec(cell: Cell, start: Start[Any], *, is_lent: bool = False) -> None:
         cell.table = start.kind._table  # Who sends before the next life begins sends what that handles.
         if (tap := cell.extra().tap) is not None:
             tap.attach()
+    cell.host.home.has_class(cell, start.kind)
     _change(cell, spec, lambda known: dataclasses.replace(known, start=start), is_noted=not is_lent)
     cell.host.parent.begins_with(cell, start)
 

@@ -42,6 +42,8 @@ class Order:
     """Whether it only looks at the state: it is obeyed beside a turn that rests, as an ask that changes nothing is."""
     is_change: ClassVar[bool] = False
     """Whether turns are not run behind it as they would have been: it is not obeyed ahead of one that had begun."""
+    is_behind_transactions: ClassVar[bool] = False
+    """Whether it is obeyed behind a transaction that holds the actor, which has tried its own change before."""
 
     def run(self, cell: Cell, actor: Actor) -> Any:
         """Carry it out; raises ControlFailed."""
@@ -101,6 +103,7 @@ class ReplaceState(Order):
 
     verb: ClassVar[str] = "replace_state"
     is_change: ClassVar[bool] = True
+    is_behind_transactions: ClassVar[bool] = True
     change: Change
 
     def run(self, cell: Cell, actor: Actor) -> Any:
@@ -124,6 +127,7 @@ class ReplaceCode(Order):
 
     verb: ClassVar[str] = "replace_code"
     is_change: ClassVar[bool] = True
+    is_behind_transactions: ClassVar[bool] = True
     start: Start[Any]
     keeps_arguments: bool  # those of the old recipe, which only the actor's supervisor knows
     change: Change | None
@@ -175,11 +179,8 @@ def has_become(cell: Cell, old: type[Actor], start: Start[Any]) -> bytes | None:
     cell.table = new._table
     if cell.more is not None and cell.more.tap is not None:
         cell.more.tap.attach()
-    for topic in old._topics:
-        if topic not in new._topics:
-            cell.node.topics.unsubscribe(topic, cell)
-    for topic in new._topics:
-        cell.node.topics.subscribe(topic, cell)
+    assert cell.ctx is not None
+    cell.ctx._has_class(old, new)
     lifecycle.limit_turns(cell)
     cell.node.ports.respec(cell, start)
     return None if cell.node.ports.uplink is None else pack_recipe(start, cell.path)

@@ -6,7 +6,7 @@ import asyncio
 from typing import TYPE_CHECKING, Any
 
 from ..errors import ControlFailed, HoldfastError, error_text, type_name
-from ..kernel import lifecycle
+from ..kernel import lifecycle, mailbox
 from ..kernel.cell import Cell
 from ..kernel.codec import MAX_BYTES
 from ..kernel.envelope import NO_DEADLINE, Ask, Item
@@ -26,6 +26,8 @@ class OrderAsked(Message[bytes]):
 
 
 ORDERED = OrderAsked()
+LOOK_AGAIN = 0.01
+"""Seconds between two looks at whether the transaction that an order waits for is over."""
 MOST_TOLD = MAX_BYTES - 4096
 """Bytes of what an order may give: with what stands around it, it fits into one message."""
 
@@ -68,6 +70,9 @@ class QueuedOrder(Item):
         if ask.is_done or ask.deadline <= ctx._cell.node.loop.time():
             return None  # Whoever gave it was told that it was not carried out.
         if ctx._postpones(call):
+            return None
+        if call.order.is_behind_transactions and mailbox.is_held_by_transaction(ctx._cell):
+            ctx._cell.node.loop.call_later(LOOK_AGAIN, call._again, ctx._cell)
             return None
         ask.started = True
         try:
@@ -120,7 +125,14 @@ class QueuedOrder(Item):
         seen = None if ctx is None or actor is None else ctx._look_beside(lambda: self.order.run(cell, actor))
         if seen is not None:
             self.give(seen[0])
-        elif cell.is_dead:
+        else:
+            self._again(cell)
+
+    def _again(self, cell: Cell) -> None:
+        """Obey it later, wherever the actor lives then."""
+        if self.ask.is_done:
+            return
+        if cell.is_dead:
             self.undelivered(cell, "it has ended")
         else:
             cell.host.control(cell, self)
@@ -246,7 +258,8 @@ def obey_order(guest: Guest, cell: Cell, frame: frames.Command) -> None:
     deadline = guest.node.loop.time() + left
     ask = RelayedAsk(ORDERED, None, (), left, deadline, None, cell, False, guest, key)
     if cell.is_dead:
-        ask.fail(lifecycle.nobody_at(cell))
+        if cell is not guest.node.root:  # Else the root hears that this life is over, and tells whoever waits.
+            ask.fail(lifecycle.nobody_at(cell))
         return
     beside = {"status": status_of, "turns": turns_of}.get(str(verb))
     if beside is not None:

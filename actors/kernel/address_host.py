@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from ..control.orders_lane import QueuedOrder as QueuedOrder
     from ..exit_reasons import ExitReason
     from ..overflow import Overflow
-    from .actor import Start
+    from .actor import Actor, Start
     from .cell import Cell, GivenName, Order
 
 
@@ -87,6 +87,9 @@ class Home:
 
     def expect(self, cell: Cell) -> None:
         """The address was made ahead of its first life in this program: what is sent there waits for that."""
+
+    def has_class(self, cell: Cell, kind: type[Actor]) -> None:
+        """The actor is of this class from now on."""
 
     def is_open(self, cell: Cell) -> bool:
         """Whether it lets messages through to the life at the address."""

@@ -675,6 +675,15 @@ class ActorContext:
         check_topic("ctx.unsubscribe", topic)
         self._cell.node.topics.unsubscribe(topic, self._cell)
 
+    def _has_class(self, old: type[Actor], new: type[Actor]) -> None:
+        """Subscribe as the class that the actor has become does."""
+        cell = self._cell
+        for topic in old._topics:
+            if topic not in new._topics:
+                cell.node.topics.unsubscribe(topic, cell)
+        for topic in new._topics:
+            cell.node.topics.subscribe(topic, cell)
+
     def _bound(self, port: str) -> ActorRef[Any] | None:
         """What a binding points to now."""
         more = self._cell.more

@@ -364,6 +364,12 @@ def held(cell: Cell) -> Hold | None:
     return next((item for item in cell.queue or () if type(item) is Hold), None)
 
 
+def is_held_by_transaction(cell: Cell) -> bool:
+    """Whether a transaction holds an actor of this process, and has tried what is to become of it."""
+    hold = held(cell)
+    return hold is not None and hold.attempt != 0
+
+
 class BoundedQueue(deque[Any]):
     """The queue of a bounded mailbox: taking a message makes room. Only these actors pay for it."""
 

@@ -107,10 +107,13 @@ class PackLife(Item):
         cell.node.loop.call_later(LOOK_AGAIN, self.hurry, cell)
 
     def withdraw(self, cell: Cell) -> None:
-        """It is not wanted any more; if a turn is before it, the next such command is not behind it."""
+        """It is not wanted any more; if a turn is before it, the next such command is not behind it.
+
+        Behind a turn that was left it stays, to end the life: that handles nothing any more.
+        """
         self.is_void = True
-        urgent = cell.extra().urgent
-        if urgent is not None and self in urgent:
+        urgent, is_adrift = cell.extra().urgent, cell.ctx is not None and cell.ctx._is_adrift
+        if urgent is not None and self in urgent and not is_adrift:
             urgent.remove(self)
 
     def _again(self, cell: Cell, life: int) -> None:

@@ -43,6 +43,7 @@ from .recorded_home import RecordedHome
 from .switch import Switch
 
 if TYPE_CHECKING:
+    from ...actors.kernel.actor import Actor
     from ...actors.kernel.address_host import Capacity, Parent
     from ...actors.kernel.envelope import Ask, Item
     from ...actors.process.worker_pool import Worker
@@ -166,11 +167,18 @@ class JournalHome(RecordedHome):
         return Entered(switch, switch.prepare(), not switch.ledger.is_new)
 
     def subscribe(self, cell: Cell, topics: Iterable[str]) -> None:
-        """Have the home admit what is published, also between two lives."""
-        assert self.switch is not None
-        end_wait(self.switch)  # It was subscribed until now, so that nothing was missed.
-        for topic in (*topics, *self.switch.topics):
-            cell.node.topics.subscribe(topic, inlet(self.switch, topic))
+        """Have the home admit what is published, also between two lives: on the topics of the class, and its own."""
+        switch = self.switch
+        assert switch is not None
+        end_wait(switch)  # It was subscribed until now, so that nothing was missed.
+        before, switch.class_topics = switch.class_topics, tuple(topics)
+        switch.leave_topics(before)
+        for topic in (*switch.class_topics, *switch.topics):
+            cell.node.topics.subscribe(topic, inlet(switch, topic))
+
+    def has_class(self, cell: Cell, kind: type[Actor]) -> None:
+        if self.switch is not None and cell.life and not cell.is_dead:
+            self.subscribe(cell, kind._topics)
 
     def over(
         self,
@@ -395,7 +403,7 @@ class JournalHome(RecordedHome):
             return
         restarting = self.parent.is_restarting(cell)
         waits = restarting and self.method.records and self._outlives(cell)
-        topics = (*self.parent.topics(cell), *self.switch.topics)
+        topics = (*self.switch.class_topics, *self.switch.topics)
         for topic in topics:
             cell.node.topics.unsubscribe(topic, inlet(self.switch, topic))
         end_wait(self.switch)  # Of the life before, if this one has not come so far.

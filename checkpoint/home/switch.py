@@ -78,7 +78,7 @@ from ..upgrade.present_classes import REPLY_TO
 from .admission import taken_up
 from .capacity import Limit
 from .disposal import lose, put_into_quarantine, undo_begun
-from .held_messages import Intake, let_go
+from .held_messages import Intake, inlet, let_go
 from .input_ledger import InputLedger, stop_entry
 from .life_ports import SENT
 from .outputs import Outputs
@@ -88,6 +88,8 @@ from .replay import PacedReplay, is_as_before, is_same_reply
 from .replay_filter import declared, turns_to_replay
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from ...actors.exit_reasons import ExitReason
     from .homes import Homes
 
@@ -108,6 +110,7 @@ class Switch:
         self.calls = PendingCalls(self)
         self.timers = Timers(self)
         self.topics: dict[str, None] = {}
+        self.class_topics: tuple[str, ...] = ()  # those of its class; `topics` are its own
         self.ties = DurableTies(self)
         self.outputs = Outputs(self)
         self.limit = Limit(self)
@@ -121,8 +124,8 @@ class Switch:
     def readdress(self, path: str) -> None:
         """Its actor has another address from now on."""
         self.path = self.ledger.path = path
-        for inlet in self.intake.inlets.values():
-            inlet.name = path
+        for one in self.intake.inlets.values():
+            one.name = path
         if self.intake.between is not None:
             self.intake.between.renamed(path)
 
@@ -130,6 +133,12 @@ class Switch:
         """Have the next life begin there, and work as this method says from now on."""
         self.cell, self.method = cell, method
         self.limit.at = method.trigger
+
+    def leave_topics(self, topics: Iterable[str]) -> None:
+        """Have nothing come in any more on those topics that neither the class subscribes to nor the actor."""
+        for topic in topics:
+            if self.cell is not None and topic not in self.class_topics and topic not in self.topics:
+                self.node.topics.unsubscribe(topic, inlet(self, topic))
 
     @property
     def turn(self) -> int:

@@ -650,6 +650,9 @@ class RecordedContext(ActorContext):
         self.recorded.last_snapshot()
         return b""
 
+    def _has_class(self, old: type[Actor], new: type[Actor]) -> None:
+        """Its home subscribes, for the address: subscriptions of this life would end with it."""
+
     @property
     def _is_adrift(self) -> bool:
         return self.recorded.stage.is_adrift

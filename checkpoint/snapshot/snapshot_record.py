@@ -225,11 +225,8 @@ def put(home: Switch, meta: Meta, keep: int) -> None:
 def go_back(home: Switch, meta: Meta) -> None:
     """Between two lives: timers, subscriptions and ties are those of the snapshot again, as the state is."""
     home.outputs.kept.clear()  # What has not taken effect yet is undone, too.
-    if home.cell is not None:
-        for topic in home.topics:
-            if topic not in meta.topics:  # Those of its class are subscribed anew with the next life.
-                home.node.topics.unsubscribe(topic, home.cell)
-    home.topics = dict.fromkeys(meta.topics)
+    before, home.topics = home.topics, dict.fromkeys(meta.topics)
+    home.leave_topics(before)
     home.timers.replace(meta.timers)
     home.ties.go_back(meta.ties)
 

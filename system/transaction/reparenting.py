@@ -259,6 +259,14 @@ class Regrouping(StagedWork):
         above = self._top.was.below
         return above is not None and f"{above.living(system._node).path}/{self._top.name}" != self._top.path
 
+    def _why_not_readdressed(self, system: ActorSystem) -> str:
+        """Why somebody cannot have another address at this instant; "" if everybody can."""
+        for one in addressed(self._top) if self._is_readdressed(system) else ():
+            cell = one.now(system._node)
+            if cell is not None and system._moves.is_moving(cell):  # Its new process knows the address of before.
+                return f"{cell.path} is on its way to live elsewhere"
+        return ""
+
     def _resting(self, system: ActorSystem) -> list[tuple[DraftPlace, Gated]]:
         """Those that run turns again, of the actor and all below it, and how each comes to rest.
 
@@ -311,7 +319,7 @@ class Regrouping(StagedWork):
     def ready(self, system: ActorSystem) -> str:
         if not (self._candidate or self._moved):
             return ""
-        if why := self._why_not_moved(system):
+        if why := self._why_not_moved(system) or self._why_not_readdressed(system):
             return why
         others = self._others(system)
         self._senders.settle(others)

@@ -1475,6 +1475,13 @@ CHECKS = {
         "tests/effects/test_changes_while_resting.py",
         "test_a_move_that_fails",
     ),
+    "a life whose turn is being left ends, also if the move is given up before that": Check(
+        "actors/migration/quiesce.py",
+        "self in urgent and not is_adrift:",
+        "self in urgent:",
+        "tests/effects/test_changes_while_resting.py",
+        "test_a_move_is_given_up_while",
+    ),
     "the state in the middle of a turn that was left is not kept": Check(
         "checkpoint/life/recorded_life.py",
         "            return  # All is replayed up to the turn that was left.\n",

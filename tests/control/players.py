@@ -191,6 +191,44 @@ class Deaf(Account):
     schema_version = 2
 
 
+class News(hf.Message):
+    what: str
+
+
+class Heard(hf.Message[list[str]]): ...
+
+
+class Reader(hf.Actor):
+    """Has heard what was published on two topics."""
+
+    def __init__(self) -> None:
+        self.heard: list[str] = []
+
+    @hf.subscribe("/old")
+    @hf.subscribe("/both")
+    @hf.on(News)
+    def news(self, message: News) -> None:
+        self.heard.append(message.what)
+
+    @hf.on(Crash)
+    def crash(self, message: Crash) -> None:
+        raise RuntimeError("crashed")
+
+    @hf.on(Heard)
+    def tell(self, message: Heard) -> list[str]:
+        return self.heard
+
+
+class NewReader(Reader):
+    """One of the topics is another one."""
+
+    @hf.subscribe("/new")
+    @hf.subscribe("/both")
+    @hf.on(News)
+    def news(self, message: News) -> None:
+        self.heard.append(message.what)
+
+
 class Whole(hf.Actor):
     """Its state is one value, through hooks."""
 

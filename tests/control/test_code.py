@@ -10,14 +10,19 @@ import pytest
 
 import holdfast as hf
 from holdfast.actors.process.wire import frames
-from tests.control.conftest import Starter
+from tests.control.conftest import WAYS, Starter
 from tests.control.players import (
     Account,
     Add,
     Cents,
+    Crash,
     Deaf,
     Euros,
+    Heard,
+    NewReader,
+    News,
     Puts,
+    Reader,
     SaidSummed,
     Sum,
     Summed,
@@ -257,3 +262,31 @@ async def test_code_of_a_recorded_actor_below_a_process_is_replaced(system: hf.A
     assert await one.ask(Add(1), timeout=30.0) == 200
     one.kill()
     assert await one.ask(Add(1), timeout=30.0) == 300
+
+
+async def publish(system: hf.ActorSystem, number: int) -> None:
+    for topic in ("/old", "/new", "/both"):
+        await system.publish(topic, News(f"{topic} {number}"))
+
+
+@pytest.mark.parametrize("way", [way for way in WAYS if "recorded" in way])
+@pytest.mark.parametrize("by_topic", [False, True], ids=["held alike", "held by topic"])
+async def test_a_recorded_actor_hears_the_topics_of_its_new_class_once_and_between_its_lives(
+    system: hf.ActorSystem, start_one: Starter, by_topic: bool
+) -> None:
+    """Its home has subscribed, for all lives; with a rule of its own a topic comes in elsewhere than the others."""
+    rules = {topic: hf.checkpoint.held(100) for topic in ("/old", "/new", "/both")} if by_topic else None
+    options = {"recovery": hf.hybrid(interval=3600.0, held=rules), "backoff": hf.Backoff(initial=0.2)}
+    one = await start_one(hf.start(Reader), **options)
+    await publish(system, 1)
+    await system.suspend(one)
+    await system.replace_code(one, NewReader)
+    await system.resume(one)
+    await publish(system, 2)
+    with system.events() as events:
+        one.tell(Crash())
+        await events.until(hf.events.ActorCrashed)
+        await publish(system, 3)
+    assert await one.ask(Heard(), timeout=30.0) == ["/old 1", "/both 1", "/new 2", "/both 2", "/new 3", "/both 3"]
+    await publish(system, 4)
+    assert (await one.ask(Heard(), timeout=30.0))[-2:] == ["/new 4", "/both 4"]

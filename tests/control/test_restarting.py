@@ -84,3 +84,29 @@ async def test_another_word_is_refused(system: hf.ActorSystem) -> None:
     with pytest.raises(hf.SpecError, match="restarting must be 'wait' or 'fail', not 'maybe'"):
         one.ask(Add(1), restarting="maybe")  # type: ignore[arg-type]
     await asyncio.sleep(0)
+
+
+@pytest.mark.parametrize("way", ["process", "recorded process", "process in a subtree"])
+async def test_an_order_to_an_actor_that_comes_back_is_not_told_that_nobody_lives_there(
+    system: hf.ActorSystem, start_one: Starter
+) -> None:
+    """Its process knows first that its life is over, and it is not what says whether another one follows."""
+    one = await start_one(hf.start(Account))
+    errors: list[Exception] = []
+
+    async def looks() -> None:
+        try:
+            await system.get_state(one, timeout=30.0)
+        except hf.HoldfastError as error:
+            errors.append(error)
+
+    for _ in range(3):
+        crashing = asyncio.ensure_future(one.ask(Crash(), timeout=30.0))
+        looking: list[asyncio.Task[None]] = []
+        while not crashing.done():
+            looking.append(asyncio.create_task(looks()))
+            await asyncio.sleep(0)
+        with pytest.raises(hf.RemoteCrash):
+            await crashing
+        await asyncio.wait(looking)
+    assert all(isinstance(error, hf.errors.AskFailed) for error in errors), errors

@@ -163,6 +163,40 @@ async def test_a_move_that_fails_ends_the_life_whose_turn_was_left(tmp_path: Pat
             assert not failed, "the life whose turn was left has said something"
 
 
+class Tidies(Patient):
+    """When a turn of it is left, that has something to do until the file is there."""
+
+    @hf.on(Go)
+    async def go(self, message: Go) -> str:
+        try:
+            return await super().go(message)
+        except asyncio.CancelledError:
+            while not os.path.exists(message.file):
+                await asyncio.sleep(0.001)
+            raise
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_a_move_is_given_up_while_the_turn_is_being_left(tmp_path: Path, isolation: Any) -> None:
+    """That life handles nothing more: what stands behind the turn is handled behind it, by the next one."""
+    world = tmp_path / "world"
+    async with running(tmp_path) as system:
+        spec = hf.child("patient", hf.start(Tidies), isolation=isolation, recovery=hf.hybrid(interval=1000.0))
+        ref = await system.start(spec)
+        asked, count = ref.ask(Go(["c"], str(world)), IN_TIME), ref.ask(Count(), IN_TIME)
+        await waits(system)
+        with system.events() as stream:
+            with pytest.raises(hf.errors.CannotMove, match="did not"):
+                await system.set_isolation(ref, OTHER[isolation], timeout=0.1)
+            await system.get_status(ref)  # Its process has heard so, too.
+            world.touch()
+            await ref.ask(Call("a"), IN_TIME)
+            assert await asked == "call a"
+            assert await count == 1
+            assert not [event for event in stream.take() if isinstance(event, hf.events.RecoveryFailed)]
+        assert await ref.ask(Look(), IN_TIME) == ["call a"]
+
+
 async def test_its_process_dies_while_it_leaves(tmp_path: Path) -> None:
     async with running(tmp_path, "os") as system:
         ref = await system.start(patient("process"))

@@ -585,3 +585,30 @@ async def test_who_is_on_its_way_to_live_elsewhere_is_not_given_away_meanwhile(
     assert (await ref.ask(Add(1), timeout=IN_TIME), system.pid_of(ref)) == (2, far)
     await move(system, ref, new)
     assert (await ref.ask(Add(1), timeout=IN_TIME), pid_of(system, "far")) == (3, far)
+
+
+@pytest.mark.parametrize("kind", ["plain", "checkpoint_only"])
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_who_is_on_its_way_to_live_elsewhere_keeps_its_address_meanwhile(
+    system: hf.ActorSystem, isolation: Any, kind: str, tmp_path: Path
+) -> None:
+    """The process in which it begins would be spoken to under an address that it does not know."""
+    one = dataclasses.replace(traveller(kind, isolation), start=hf.start(Reluctant, str(tmp_path / "no")))
+    await system.start(hf.supervisor("near", children=[one]))
+    await system.start(hf.supervisor("elsewhere"))
+    ref = system.ref("/app/near/one", Reluctant)
+    assert await ref.ask(Add(1), timeout=IN_TIME) == 1
+    (tmp_path / "no").touch()
+    to: Any = "task" if isolation == "process" else "process"
+    moved = asyncio.ensure_future(system.set_isolation(ref, to, timeout=IN_TIME))
+    async with asyncio.timeout(IN_TIME):
+        while not (tmp_path / "no.met").exists():
+            await asyncio.sleep(0.005)
+    with pytest.raises(hf.TransactionFailed, match="is on its way to live elsewhere"):
+        async with system.transaction(timeout=0.5) as change:
+            change.move(ref, "/app/elsewhere")
+    (tmp_path / "no").unlink()
+    await moved
+    assert await ref.ask(Add(1), timeout=IN_TIME) == 2
+    await move(system, ref, "elsewhere")
+    assert await ref.ask(Add(1), timeout=IN_TIME) == 3

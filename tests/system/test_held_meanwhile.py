@@ -27,6 +27,10 @@ def hundred(state: dict[str, Any]) -> dict[str, Any]:
     return {**state, "count": state["count"] + 100}
 
 
+def doubled(state: dict[str, Any]) -> dict[str, Any]:
+    return {**state, "count": state["count"] * 2}
+
+
 class Gap:
     """Tells an actor one thing after another, and takes down how long it let the longest wait."""
 
@@ -106,3 +110,31 @@ async def test_who_is_at_rest_goes_on_while_another_one_is_restarted(
     more = 0 if fails or what != "replace_state" else 100
     assert await held.ask(Add(0), IN_TIME) == gap.told + more
     assert await away.ask(Add(0), IN_TIME) == 5 + (0 if fails else 100)
+
+
+@pytest.mark.parametrize("fails", [False, True])
+@pytest.mark.parametrize("recovery", [None, hf.hybrid(interval=60.0)], ids=["plain", "recorded"])
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_a_state_that_is_replaced_while_the_actor_is_held_is_replaced_behind_that(
+    system: hf.ActorSystem, isolation: Any, recovery: Any, fails: bool
+) -> None:
+    """The transaction puts in force what it has tried: what came in between would be gone, and was acknowledged."""
+    one = await system.start(hf.child("one", hf.start(Counter, 5), isolation=isolation, recovery=recovery))
+    given: list[asyncio.Future[Any]] = []
+
+    async def beside(running: hf.ActorSystem) -> None:
+        given.append(asyncio.ensure_future(running.replace_state(one, doubled, timeout=IN_TIME)))
+        await asyncio.sleep(0)
+        await running.get_status(one)  # The order has come to where the actor lives.
+        if fails:
+            raise hf.HoldfastError("given up")
+
+    try:
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.replace_state(one, hundred)
+            change.step(Stumble(beside))
+    except hf.TransactionFailed:
+        assert fails
+    after = 10 if fails else 210
+    assert (await given[0])["count"] == after
+    assert await one.ask(Add(0), IN_TIME) == after

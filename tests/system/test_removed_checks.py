@@ -782,6 +782,13 @@ CHECKS = {
         FAR,
         "test_who_is_on_its_way and plain",
     ),
+    "nobody has another address on its way to live elsewhere": Check(
+        "system/transaction/reparenting.py",
+        "system._moves.is_moving(cell):",
+        "False:",
+        FAR,
+        "test_who_is_on_its_way_to_live_elsewhere_keeps",
+    ),
     "a change whose turn it is not yet is given up": Check(
         "system/live_moves.py",
         "            gate.on_closed(give_up)\n",
@@ -2149,6 +2156,20 @@ CHECKS = {
         "    except ZeroDivisionError as error:",
         "tests/supervision/test_dynamic.py",
         "test_arguments_from_a_process_that_lies",
+    ),
+    "what a transaction has tried of an actor is not overtaken by an order": Check(
+        "actors/control/orders_lane.py",
+        "if call.order.is_behind_transactions and",
+        "if False and",
+        "tests/system/test_held_meanwhile.py",
+        "test_a_state_that_is_replaced_while",
+    ),
+    "a process does not say that nobody lives at the address of its own actor": Check(
+        "actors/control/orders_lane.py",
+        "        if cell is not guest.node.root:",
+        "        if True:",
+        "tests/control/test_restarting.py",
+        "test_an_order_to_an_actor_that_comes_back",
     ),
 }
 

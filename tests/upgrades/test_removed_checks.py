@@ -244,6 +244,27 @@ CHECKS = {
         READ,
         "test_what_effects_have_ended_with and error",
     ),
+    "the subscriptions of a recorded actor are not those of its life": Check(
+        "checkpoint/life/recorded_context.py",
+        '        """Its home subscribes, for the address: subscriptions of this life would end with it."""\n',
+        "        super()._has_class(old, new)\n",
+        CODE,
+        "test_a_recorded_actor_hears_the_topics and process",
+    ),
+    "a home subscribes as the class that its actor has become": Check(
+        "supervision/respec.py",
+        "    cell.host.home.has_class(cell, start.kind)\n",
+        "",
+        CODE,
+        "test_a_recorded_actor_hears_the_topics",
+    ),
+    "a home hears the topics of the class before no more": Check(
+        "checkpoint/home/journal_home.py",
+        "        switch.leave_topics(before)\n",
+        "",
+        CODE,
+        "test_a_recorded_actor_hears_the_topics",
+    ),
 }
 
 test_the_table_is_true, test_without_the_check_a_test_fails = as_tests(CHECKS)
