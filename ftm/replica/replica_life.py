@@ -11,7 +11,7 @@ from ...actors.kernel.cell import Cell
 from ...actors.kernel.envelope import Item
 from ...actors.kernel.ref import ActorRef
 from ...checkpoint.life.recorded_context import RecordedContext
-from ...checkpoint.life.recorded_inbox import RECOVERED, STARTED, Fed, Hook
+from ...checkpoint.life.recorded_inbox import RECOVERED, STARTED, Fed, Hook, WorkFailed
 from ...checkpoint.life.recorded_life import Life
 from ...checkpoint.method import Method
 from ...checkpoint.protocol import FAILED, Answer, Feed, Out, ToHome, TurnEnd
@@ -211,8 +211,12 @@ class ServerLife(Life):
         if is_last:
             self.server.last_snapshot()
 
+    def work_failed(self, failed: WorkFailed) -> None:
+        """Each replica ends at a time of its own, and begins with a point, or with what is recorded."""
+        self.cell.push(failed)
+
     def save_before_crash(self) -> None:
-        """Each replica ends at a time of its own: the points of all of them are made together."""
+        """Points are made by the server, between requests."""
 
     def want_snapshot(self) -> None:
         self.server.want_snapshot()

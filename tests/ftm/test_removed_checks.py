@@ -20,6 +20,13 @@ FAILOVER, CHECKS_ALONE = "tests/ftm/test_failover.py", "tests/ftm/test_checks.py
 AUTHORS = "tests/ftm/test_author_bricks.py"
 REVOKED, LINKS = "tests/ftm/test_revoked_replicas.py", "tests/ftm/sec/test_link.py"
 CHECKS = {
+    "a task that raises ends its replica also before that is live": Check(
+        "ftm/replica/replica_life.py",
+        "        self.cell.push(failed)\n",
+        "        super().work_failed(failed)\n",
+        "tests/checkpoint/test_hook_changes.py",
+        "test_replicas_that_die_before_they_say and falls",
+    ),
     "the end of a replica that is not wanted any more is no fault": Check(
         "ftm/group/group_place.py",
         "                group.replicas.dismiss()\n",
