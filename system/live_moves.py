@@ -454,7 +454,8 @@ class _Attempts:
             ActorStopped, AskTimeout.
         """
         cell, closed = self._cell, self._gate.closed
-        if cell.host.is_up(cell):
+        is_known = not (self._gate.lives_ended and isinstance(cell.host, OutsideHost))  # Else its process knows that.
+        if is_known and cell.host.is_up(cell):
             return
         up = order(cell, Ready(), max(self._end - cell.node.loop.time(), LAST_LOOK))
         try:

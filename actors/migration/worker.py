@@ -146,6 +146,7 @@ class FromOwnWorker(Leaving):
 
     def _died_before_rest(self, cell: Cell, reason: ExitReason) -> None:
         """The process ends while the life still is the place's, which deals with that; nobody else tells the move."""
+        self.move.is_late = True
         self.move.give_up("its life has ended" if reason.is_clean else f"its process has died ({reason})")
         self.place.died(cell, reason)
 

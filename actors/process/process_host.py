@@ -585,6 +585,9 @@ class WorkerPlace(Place):
     def process(self, cell: Cell) -> Worker | None:
         return self.workers.of(cell)
 
+    def is_up(self, cell: Cell) -> bool:
+        return self.process(cell) is not None
+
     def spec_data(self, cell: Cell) -> dict[str, Any]:
         return {"layers": [], "isolation": "process", "limits": limits_data(self._limits)}
 

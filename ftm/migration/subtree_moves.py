@@ -212,6 +212,7 @@ class FromSubtree(Leaving):
         move = self.move
         match step:
             case "refused":
+                move.is_late = bool(told.get("has_ended"))
                 move.give_up(str(told["why"]))
             case "taken" if not move.given_up.done():
                 try:

@@ -75,7 +75,7 @@ class PlainChild:
         """`for_home`: its state is packed as a home has it; else as a process takes it, with its handles."""
         cell = self._guest.node.find(self._path)
         if cell is None or cell.state is not RUNNING or cell.host is not self._guest.node.ports.here:
-            self._say("refused", why="it is being restarted; try again")
+            self._say("refused", why="it is being restarted", has_ended=True)
             return
         at_rest = self._at_rest_for_home if for_home else self._at_rest
         take = PackLife(self._owe, at_rest, lambda why: self._say("refused", why=why))
@@ -83,7 +83,7 @@ class PlainChild:
 
         def ended(done: asyncio.Future[Any]) -> None:
             if self._take is take and not take.is_done:
-                self._say("refused", why="its life has ended; try again")
+                self._say("refused", why="its life has ended", has_ended=True)
 
         cell.ended().add_done_callback(ended)
         lifecycle.urge(cell, take)

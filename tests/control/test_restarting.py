@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 from typing import Any
 
 import pytest
@@ -110,3 +111,36 @@ async def test_an_order_to_an_actor_that_comes_back_is_not_told_that_nobody_live
             await crashing
         await asyncio.wait(looking)
     assert all(isinstance(error, hf.errors.AskFailed) for error in errors), errors
+
+
+def other_place(way: str) -> Any:
+    return "task" if "process" in way else "process"
+
+
+async def test_an_actor_that_is_being_restarted_is_moved_in_its_next_life(
+    system: hf.ActorSystem, start_one: Starter, way: str
+) -> None:
+    one = await start_one(hf.start(Account), backoff=hf.Backoff(initial=1.0, jitter=0.0))
+    with system.events() as events:
+        one.tell(Crash())
+        await events.until(hf.events.ActorCrashed)
+        await system.set_isolation(one, other_place(way), timeout=30.0)
+        [moved] = [event for event in events.take() if isinstance(event, hf.events.Moved)]
+        assert moved.to == other_place(way)
+    assert await one.ask(Add(1), timeout=30.0) == 1
+
+
+async def test_an_actor_that_crashes_before_it_is_at_rest_is_moved_in_its_next_life(
+    system: hf.ActorSystem, start_one: Starter, way: str
+) -> None:
+    one = await start_one(hf.start(Account), backoff=hf.Backoff(initial=0.01, jitter=0.0))
+    for _ in range(3):
+        one.tell(Crash())
+        to: Any = "process" if system.pid_of(one) == parent_of(system, way) else "task"
+        await system.set_isolation(one, to, timeout=30.0)
+    assert await one.ask(Add(1), timeout=30.0) == 1
+
+
+def parent_of(system: hf.ActorSystem, way: str) -> int:
+    """The process in which it lives as a task."""
+    return system.pid_of(system.ref("/app/top", hf.Actor)) if "subtree" in way else os.getpid()

@@ -2171,6 +2171,20 @@ CHECKS = {
         "tests/control/test_restarting.py",
         "test_an_order_to_an_actor_that_comes_back",
     ),
+    "whose process dies before it is at rest is moved in its next life": Check(
+        "actors/migration/worker.py",
+        "        self.move.is_late = True\n        self.move.give_up(",
+        "        self.move.give_up(",
+        "tests/control/test_restarting.py",
+        "test_an_actor_that_crashes_before and subtree",
+    ),
+    "who is restarted below a process is moved in its next life": Check(
+        "ftm/migration/subtree_moves.py",
+        'bool(told.get("has_ended"))',
+        "False",
+        "tests/control/test_restarting.py",
+        "test_an_actor_that_is_being_restarted_is_moved and subtree",
+    ),
 }
 
 test_the_table_is_true, test_without_the_check_a_test_fails = as_tests(CHECKS)
