@@ -167,7 +167,7 @@ class Tidies(Patient):
     """When a turn of it is left, that has something to do until the file is there."""
 
     @hf.on(Go)
-    async def go(self, message: Go) -> str:
+    async def go(self, message: Go) -> str | hf.ReplyHandle[str]:
         try:
             return await super().go(message)
         except asyncio.CancelledError:
