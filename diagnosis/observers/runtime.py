@@ -130,12 +130,13 @@ class RuntimeObserver(Observer):
     """Says who gets on, answers, keeps up, ends again and again, whose mailbox is full, and who waits for whom.
 
     An actor is late if asks of it were not answered in time, or if others wait for it, up or not, longer than the
-    longest turn it was seen to need, four times over, and had nothing to do behind; and so are all whose turns have waited for each other in a circle for `patience`.
-    An actor is late as well if messages wait that it was only told; but then it may rest, in a sleep or an effect of
-    its own (`ctx.sleep`, `ctx.effect`). Who is late because it waits for another one is not accused: the last one in
-    that row is, also if a mailbox only grows because each turn waits for it. If the row leads back to its beginning,
-    all in the circle are. Whether an actor answers is said only if it was asked. What is said against one is taken back
-    when it is true again, and else is unknown `time_to_live` seconds after the last reason for it.
+    longest turn it was seen to need, four times over, and had nothing to do behind; and so are all whose turns have
+    waited for each other in a circle for `patience`. An actor is late as well if messages wait that it was only told;
+    but then it may rest, in a sleep or an effect of its own (`ctx.sleep`, `ctx.effect`). Who is late because it waits
+    for another one is not accused: the last one in that row is, also if a mailbox only grows because each turn waits
+    for it. If the row leads back to its beginning, all in the circle are. Whether an actor answers is said only if it
+    was asked. What is said against one is taken back when it is true again, and else is unknown `time_to_live` seconds
+    after the last reason for it.
 
     Args:
         actors: component to address; it may change, and what is in it at a look is looked at.
