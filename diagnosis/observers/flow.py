@@ -332,12 +332,27 @@ class FlowObserver(Observer):
             for wanted in flow.inputs:
                 self._users.setdefault(wanted, []).append(flow)
         self._learn_from_before()
-        for topic, made in self._made.items():
-            flows = self._flows_well(topic, made)
+        seen = {topic: self._flows_well(topic, made) for topic, made in self._made.items()}
+        for topic in self._seen_to_come(seen):
+            seen[topic] = True
+        for topic, flows in seen.items():
             self.verdict(ok(word_for(topic)), flows, self._flows[topic].since)
         if self.now - self._saved > 60.0:
             self._saved = self.now
             await self._baselines.save()
+
+    def _seen_to_come(self, seen: Mapping[str, bool | None]) -> set[str]:
+        """Topics of which nothing is known just now, as nothing comes, and by whose messages another one is missed.
+
+        It is missed by what has come: its inputs are not to blame, however long they pause behind that.
+        """
+        came = set[str]()
+        for flow in (self._flows[topic] for topic, flows in seen.items() if flows is False):
+            for wanted in flow.inputs:
+                last = self._flows[wanted].last if seen.get(wanted, False) is None else None
+                if last is not None and (flow.poor > 1 or last >= flow.due):
+                    came.add(wanted)
+        return came
 
     async def on_stop(self, reason: ExitReason) -> None:
         """Keep what was learned beyond this life."""

@@ -75,6 +75,13 @@ CHECKS = {
         FLOW,
         "behind_a_pause",
     ),
+    "what another one is missed by has come": Check(
+        "diagnosis/observers/flow.py",
+        "            seen[topic] = True\n",
+        "            pass\n",
+        FLOW,
+        "what_has_come",
+    ),
     "who waits for a reply is silent by that": Check(
         "diagnosis/observers/flow.py",
         "patience = self._patience + min(flow.waited, self._patience)",

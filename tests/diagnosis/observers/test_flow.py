@@ -233,6 +233,16 @@ async def test_behind_a_pause_it_is_silent_from_when_something_comes_in(world: W
     assert ok("/out") not in world.bad
 
 
+async def test_who_is_missed_by_what_has_come_is_so_however_long_that_pauses(world: World) -> None:
+    rng = random.Random(1)
+    await world.set_each(1)
+    await world.send(40, 1.5, burst=20, rng=rng)
+    await world.set_each(0)
+    await world.send(10, 1.0, burst=20)
+    await asyncio.sleep(30.0)
+    assert world.said == {ok("/in"): True, ok("/out"): False}
+
+
 async def test_who_waits_for_a_reply_is_silent_by_that(world: World) -> None:
     await world.set_each(1)
     await world.send(400, 0.1)
