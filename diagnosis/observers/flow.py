@@ -389,19 +389,17 @@ class FlowObserver(Observer):
             had_turns = not made.is_lines and len(works) == len(flow.works) and any(map(_had_turns, flow.works, works))
             flow.due = flow.due if flow.came_in else now
             flow.came_in, flow.works = flow.came_in + had_turns, works
+        silent = now - (flow.began if flow.last is None else flow.last)
+        if not flow.inputs or 2 * silent > self._patience:
             for cell in cells:
                 cell.host.ask_turns(cell)  # for the next look
         if flow.last is None and learned.count < ENOUGH:
             return None
-        silent = now - (flow.began if flow.last is None else flow.last)
         if learned.count < ENOUGH:
             return True if silent < self._patience else None
         # Who waits for another one's reply is silent by that; whoever looks at turns says who is late.
         flow.waited += self.manner.every if any(cell.host.awaits(cell) for cell in cells) else 0.0
         patience = self._patience + min(flow.waited, self._patience)
-        if 2 * silent > self._patience:
-            for cell in cells:
-                cell.host.ask_turns(cell)  # for the next look
         is_long = silent > max(patience, LONGER * learned.longest_gap)
         is_due = flow.came_in > learned.in_doubt + LONGER * flow.most_in(learned)
         # A burst, however many messages are in it, has no rhythm yet.
