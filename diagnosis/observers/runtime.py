@@ -96,7 +96,8 @@ class _Seen:
             stood = now - max(self.since, self.idle)
             if stood > self.longest and (self.is_in_turn or stood > patience):
                 self.longer.append(stood)
-            if len(self.longer) >= LOOKS:  # It never has nothing to do: that is its way.
+            # Of who is not known yet all is usual; and who never has nothing to do goes on like this.
+            if self.turns < LOOKS or len(self.longer) >= LOOKS:
                 self.learn()
         self.is_in_turn = work.is_in_turn
         if has_got_on:

@@ -98,10 +98,17 @@ CHECKS = {
     ),
     "turns that only get longer are no measure": Check(
         "diagnosis/observers/runtime.py",
-        "            if len(self.longer) >= LOOKS:",
+        "            if self.turns < LOOKS or len(self.longer) >= LOOKS:",
         "            if self.longer:",
         RUNTIME,
         "only_get_longer",
+    ),
+    "of who is not known yet all turns are usual": Check(
+        "diagnosis/observers/runtime.py",
+        "            if self.turns < LOOKS or len(self.longer) >= LOOKS:",
+        "            if len(self.longer) >= LOOKS:",
+        KINDS,
+        "full_by_its_policy",
     ),
     "how long turns have taken is usual behind them": Check(
         "diagnosis/observers/runtime.py",
