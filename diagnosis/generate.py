@@ -434,10 +434,12 @@ def observers_for(
         generated: what was found.
         window: seconds of silence of a topic that are never too long.
         hung_after: see `NodeObserver`.
-        manner: of the first and the last; by default two of three looks must agree, so that a restart is no fault yet.
+        manner: of the first and the last; by default two of three looks must agree, so that a restart is no fault yet,
+            and topics are looked at five times as often as actors: silence is seen by looking.
         wiring: what they go by; it follows the system if a `ModelFollower` has it, too.
         baselines: what is usual of each topic, if that is to outlive the program.
     """
+    at_topics = manner or Manner(every=0.2, agreement=Agreement(2, 3))
     manner = manner or Manner(agreement=Agreement(2, 3))
     wiring = wiring or LiveWiring(generated)
     nodes = {"hung_after": hung_after, "manner": manner}
@@ -447,5 +449,5 @@ def observers_for(
         observer("nodes", Start(NodeObserver, (wiring.addresses,), nodes)),
         observer("runtime", Start(RuntimeObserver, (wiring.addresses,), {"asked": wiring.asked})),
         observer("replicas", Start(ReplicaObserver, (wiring.protected,))),
-        observer("topics", Start(FlowObserver, (wiring.made,), {**flow, "manner": manner})),
+        observer("topics", Start(FlowObserver, (wiring.made,), {**flow, "manner": at_topics})),
     )

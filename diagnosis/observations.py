@@ -24,13 +24,15 @@ MOST_LIARS: Final = 3
 class Observation(Message, gc=False):
     """One literal as seen by one source; what observers publish on `/observations`.
 
-    `time` is in seconds on the loop clock (T67); after `time + time_to_live` the literal is unknown again.
+    `time` is in seconds on the loop clock (T67); after `time + time_to_live` the literal is unknown again. `since` is
+    when that began which shows it, such as a silence; None if that is not known.
     """
 
     literal: Literal
     time: float
     source: str
     time_to_live: float = 5.0
+    since: float | None = None
 
     def is_current(self, now: float) -> bool:
         """Say whether it still counts at `now`."""

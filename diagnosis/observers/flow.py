@@ -64,6 +64,7 @@ class Usual(msgspec.Struct):
         seconds: of all silences.
         odd_seconds: of those that were out of rhythm.
         long_seconds: of those that were out of rhythm by more than a moment.
+        made: messages before which something had come in.
     """
 
     count: int = 0
@@ -75,6 +76,12 @@ class Usual(msgspec.Struct):
     seconds: float = 0.0
     odd_seconds: float = 0.0
     long_seconds: float = 0.0
+    made: int = 0
+
+    @property
+    def in_doubt(self) -> float:
+        """What has to come in beyond what is usual: the more messages have shown what that is, the less."""
+        return ENOUGH // 2 * min(1.0, ENOUGH / max(1, self.made))
 
     @property
     def goes_by_clock(self) -> bool:
@@ -92,6 +99,7 @@ class Usual(msgspec.Struct):
         self.mean_gap += (gap - self.mean_gap) / min(self.count, 1000)
         self.longest_gap = max(self.longest_gap, gap)
         self.most_in = max(self.most_in, came_in)
+        self.made += came_in > 0
         self.seconds += gap
         if gap > REGULAR * self.mean_gap:
             self.odd_seconds += gap
@@ -151,12 +159,18 @@ class _Flow:
     """What is seen of one topic."""
 
     __slots__ = (
-        "began", "came_in", "guess", "in_block", "inputs", "is_cut", "is_missed", "last", "lives", "missed",
-        "out_of_block", "poor", "recent", "seen", "works",
+        "began", "came_in", "due", "guess", "in_block", "inputs", "is_cut", "is_missed", "last", "lives", "missed",
+        "out_of_block", "poor", "recent", "seen", "since", "waited", "works",
     )  # fmt: skip
 
     began: float
+    due: float
+    """When the first of what has come in since the last message did."""
+    since: float | None
+    """When the silence began that is told, on the loop clock."""
     last: float | None
+    waited: float
+    """Seconds in which its publishers have waited for replies since the last message."""
     recent: list[float]
 
     def __init__(self, now: float) -> None:
@@ -174,8 +188,10 @@ class _Flow:
 
     def begin(self, now: float) -> None:
         """Nothing that came before counts."""
-        self.began, self.last = now, None
+        self.began = self.due = now
+        self.last = self.since = None
         self.came_in = self.in_block = self.out_of_block = self.poor = 0
+        self.waited = 0.0
         self.recent = []
 
     def look_at(self, publishers: list[Cell]) -> None:
@@ -213,15 +229,16 @@ class FlowObserver(Observer):
 
     A topic should flow while its inputs come; one without inputs, while its publishers have turns, or if it goes by a
     clock. What its publishers hear no more is an input until a message goes out without it. It is silent for too long
-    after four times what came in, and after four times what has passed, between two messages at most so far. Of what
-    comes in, at least half of the usual part must go out. Until enough was heard, and while nothing comes in, nothing
-    is known.
+    after four times what came in, and a few more while little is known, or after four times what has passed, between
+    two messages at most so far. Of what comes in, at least half of the usual part must go out. Until enough was heard,
+    and while nothing comes in, nothing is known.
 
     Args:
         made: topic to how it comes about; it may change.
         heard: where to note who publishes what, by address.
         leave_out: topics that are not listened to.
-        patience: seconds of silence that are never too long.
+        patience: seconds of silence that are never too long, from when something has come in; time in which a publisher
+            waits for a reply is added to it, up to as much again.
         baselines: what is usual.
         arrivals: what was heard before; it is learned from once, and taken out.
         manner: see `Observer`.
@@ -283,10 +300,11 @@ class FlowObserver(Observer):
                 if flow.takes_silence():
                     learned.take(gap, flow.came_in)
                     flow.seen += flow.came_in > 0
-            flow.last, flow.came_in = now, 0
+            flow.last, flow.came_in, flow.waited = now, 0, 0.0
             flow.inputs.intersection_update(self._made[topic].inputs)
             flow.out_of_block += 1
         for user in self._users.get(topic, ()):
+            user.due = user.due if user.came_in else now
             user.came_in += 1
             user.in_block += 1
 
@@ -314,11 +332,27 @@ class FlowObserver(Observer):
             for wanted in flow.inputs:
                 self._users.setdefault(wanted, []).append(flow)
         self._learn_from_before()
-        for topic, made in self._made.items():
-            self.verdict(ok(word_for(topic)), self._flows_well(topic, made))
+        seen = {topic: self._flows_well(topic, made) for topic, made in self._made.items()}
+        for topic in self._seen_to_come(seen):
+            seen[topic] = True
+        for topic, flows in seen.items():
+            self.verdict(ok(word_for(topic)), flows, self._flows[topic].since)
         if self.now - self._saved > 60.0:
             self._saved = self.now
             await self._baselines.save()
+
+    def _seen_to_come(self, seen: Mapping[str, bool | None]) -> set[str]:
+        """Topics of which nothing is known just now, as nothing comes, and by whose messages another one is missed.
+
+        It is missed by what has come: its inputs are not to blame, however long they pause behind that.
+        """
+        came = set[str]()
+        for flow in (self._flows[topic] for topic, flows in seen.items() if flows is False):
+            for wanted in flow.inputs:
+                last = self._flows[wanted].last if seen.get(wanted, False) is None else None
+                if last is not None and (flow.poor > 1 or last >= flow.due):
+                    came.add(wanted)
+        return came
 
     async def on_stop(self, reason: ExitReason) -> None:
         """Keep what was learned beyond this life."""
@@ -353,20 +387,28 @@ class FlowObserver(Observer):
         flow.look_at(cells)
         if not flow.inputs:  # Its publishers' turns are what comes in.
             had_turns = not made.is_lines and len(works) == len(flow.works) and any(map(_had_turns, flow.works, works))
+            flow.due = flow.due if flow.came_in else now
             flow.came_in, flow.works = flow.came_in + had_turns, works
+        silent = now - (flow.began if flow.last is None else flow.last)
+        if not flow.inputs or 2 * silent > self._patience:
             for cell in cells:
                 cell.host.ask_turns(cell)  # for the next look
         if flow.last is None and learned.count < ENOUGH:
             return None
-        silent = now - (flow.began if flow.last is None else flow.last)
         if learned.count < ENOUGH:
             return True if silent < self._patience else None
-        is_long = silent > max(self._patience, LONGER * learned.longest_gap)
-        is_due = flow.came_in > ENOUGH // 2 + LONGER * flow.most_in(learned)
-        is_steady = not made.is_lines or learned.seconds > STEADY
+        # Who waits for another one's reply is silent by that; whoever looks at turns says who is late.
+        flow.waited += self.manner.every if any(cell.host.awaits(cell) for cell in cells) else 0.0
+        patience = self._patience + min(flow.waited, self._patience)
+        is_long = silent > max(patience, LONGER * learned.longest_gap)
+        is_due = flow.came_in > learned.in_doubt + LONGER * flow.most_in(learned)
+        # A burst, however many messages are in it, has no rhythm yet.
+        is_steady = learned.seconds > (STEADY if made.is_lines else self._patience)
         is_by_clock = not flow.inputs and is_steady and learned.goes_by_clock
-        if (is_due and silent > self._patience) or (is_by_clock and is_long):
-            flow.is_missed = True
+        flow.since = None
+        is_due = is_due and now - flow.due > patience
+        if is_due or (is_by_clock and is_long):
+            flow.is_missed, flow.since = True, self.now - (now - flow.due if is_due else silent)
             return False
         if flow.inputs and flow.in_block >= BLOCK and all(map(_is_idle, cells, works)):  # All of it was worked off.
             flow.end_block(learned)

@@ -53,11 +53,12 @@ class Look(Message):
 class _Word:
     """What was said of one atom, or of the trend of one value."""
 
-    __slots__ = ("debounce", "said", "time")
+    __slots__ = ("debounce", "said", "since", "time")
 
     def __init__(self, agreement: Agreement) -> None:
         self.debounce = Debounce[Literal](agreement)
         self.said: Literal | None = None
+        self.since: float | None = None
         self.time = 0.0
 
 
@@ -109,21 +110,28 @@ class Observer(Actor):
         """Seconds since this observer began."""
         return self.now - self._began
 
-    def verdict(self, atom: Literal | str, holds: bool | None) -> None:
+    def verdict(self, atom: Literal | str, holds: bool | None, since: float | None = None) -> None:
         """Take one more sample: the atom (`ok("disk")`, or "ok(disk)") holds, or does not, or (None) nothing is known.
+
+        Args:
+            atom: what this is about.
+            holds: whether it does.
+            since: when that began which shows it, on the loop clock; None if that is not known. What has lasted for
+                long when it is said need not be looked at for long before repair acts on it.
 
         Raises:
             BadLiteral: the text is no atom. TypeError: it is neither an atom nor a text.
         """
         about = atom_of(atom)
-        self.say(about, None if holds is None else about if holds else ~about)
+        self.say(about, None if holds is None else about if holds else ~about, since)
 
-    def say(self, about: Literal | str, literal: Literal | str | None) -> None:
+    def say(self, about: Literal | str, literal: Literal | str | None, since: float | None = None) -> None:
         """Take one more sample of something of which different literals can be said, such as the trend of a value."""
         about, literal = literal_of(about), None if literal is None else literal_of(literal)
         word = self._words.get(about)
         if word is None:
             word = self._words[about] = _Word(self.manner.agreement)
+        word.since = since
         settled = word.debounce(literal)
         if settled is not None or literal is None or literal != word.said:  # What is seen again is not taken back.
             self._settle(word, settled)
@@ -188,7 +196,7 @@ class Observer(Actor):
                 word.said = None
         elif settled != word.said or now - word.time >= self.manner.time_to_live / RENEWALS:
             word.said, word.time = settled, now
-            self._outbox.append(Observation(settled, now, self.ctx.path, self.manner.time_to_live))
+            self._outbox.append(Observation(settled, now, self.ctx.path, self.manner.time_to_live, word.since))
 
     def _is_spared(self, literal: Literal, now: float) -> bool:
         return now < self._began + self.manner.grace or any(now < self._grace.get(name, 0.0) for name in literal.args)

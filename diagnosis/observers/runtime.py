@@ -65,8 +65,12 @@ class _Seen:
     """When it was seen to get on for the last time, by such turns or others."""
     longest: float = 0.0
     """Seconds of the longest turn that was seen to end."""
+    longer: list[float] = dataclasses.field(default_factory=list[float])
+    """Those of turns that took longer, and behind which it has not been seen with nothing to do yet."""
     full: float | None = None
     """Since when its mailbox takes nothing more."""
+    down: float | None = None
+    """Since when it is not up."""
     unanswered: deque[tuple[float, float]] = dataclasses.field(default_factory=lambda: deque(maxlen=16))
     """When asks of it have failed, and when they were made."""
     refused: float = -math.inf
@@ -86,15 +90,25 @@ class _Seen:
             self.life, self.mark, self.since = life, work.mark, now
             self.unanswered.clear()
             self.backlog.clear()
+            self.longer.clear()
         has_got_on = work.mark is not self.mark
         if has_got_on or (self.is_in_turn and not work.is_in_turn):  # A turn is over that was seen, or that was missed.
             stood = now - max(self.since, self.idle)
-            self.longest = max(self.longest, stood if self.is_in_turn or stood > patience else 0.0)
+            if stood > self.longest and (self.is_in_turn or stood > patience):
+                self.longer.append(stood)
+            # Of who is not known yet all is usual; and who never has nothing to do goes on like this.
+            if self.turns < LOOKS or len(self.longer) >= LOOKS:
+                self.learn()
         self.is_in_turn = work.is_in_turn
         if has_got_on:
             self.mark, self.turns = work.mark, self.turns + 1
             self.since = now if work.since is None else max(work.since, self.since)
         return has_got_on
+
+    def learn(self) -> None:
+        """How long its turns have taken is usual, as it has come to their end; until then they may only get longer."""
+        self.longest = max(self.longest, *self.longer, 0.0)
+        self.longer.clear()
 
 
 class _Shown(NamedTuple):
@@ -102,6 +116,8 @@ class _Shown(NamedTuple):
 
     is_late: bool
     """Others wait for it too long, or messages do, while it does not rest as it has said."""
+    since: float
+    """When that began which makes it late, if it is."""
     is_asked: bool
     """An ask of it waits, or has run out lately."""
     is_full: bool
@@ -114,13 +130,14 @@ class _Shown(NamedTuple):
 class RuntimeObserver(Observer):
     """Says who gets on, answers, keeps up, ends again and again, whose mailbox is full, and who waits for whom.
 
-    An actor is late if asks of it were not answered in time, or if others wait for it longer than the longest turn it
-    was seen to need, four times over; and so are all whose turns have waited for each other in a circle for `patience`.
-    An actor is late as well if messages wait that it was only told; but then it may rest, in a sleep or an effect of
-    its own (`ctx.sleep`, `ctx.effect`). Who is late because it waits for another one is not accused: the last one in
-    that row is, also if a mailbox only grows because each turn waits for it. If the row leads back to its beginning,
-    all in the circle are. Whether an actor answers is said only if it was asked. What is said against one is taken back
-    when it is true again, and else is unknown `time_to_live` seconds after the last reason for it.
+    An actor is late if asks of it were not answered in time, or if others wait for it, up or not, longer than the
+    longest turn it was seen to need, four times over, and had nothing to do behind; and so are all whose turns have
+    waited for each other in a circle for `patience`. An actor is late as well if messages wait that it was only told;
+    but then it may rest, in a sleep or an effect of its own (`ctx.sleep`, `ctx.effect`). Who is late because it waits
+    for another one is not accused: the last one in that row is, also if a mailbox only grows because each turn waits
+    for it. If the row leads back to its beginning, all in the circle are. Whether an actor answers is said only if it
+    was asked. What is said against one is taken back when it is true again, and else is unknown `time_to_live` seconds
+    after the last reason for it.
 
     Args:
         actors: component to address; it may change, and what is in it at a look is looked at.
@@ -205,14 +222,14 @@ class RuntimeObserver(Observer):
         for component, path in self._actors.items():
             cell = self._node.find(path)
             if cell is not None and cell.state is RUNNING and cell.host.is_up(cell):
+                if self._seen(component).down is not None:
+                    self._come_back(component)
                 shown[component] = self._look_at(component, cell, asked_since.get(component), waits, now)
-            else:
-                seen = self._seen(component)
-                seen.full = None
-                seen.backlog.clear()
+            elif (of_it := self._look_at_place(component, asked_since.get(component), now)).is_late:
+                shown[component] = of_it
+            elif component not in self._loops:
                 for atom in (progress(component), replies(component), room(component), keeps_up(component)):
-                    if component not in self._loops:
-                        self.verdict(atom, None)
+                    self.verdict(atom, None)
         for circle in self._circles(waits, shown, now):
             waits |= {component: {following} for component, following in circle.items()}
             shown |= {component: shown[component]._replace(is_late=True, is_asked=True) for component in circle}
@@ -322,6 +339,7 @@ class RuntimeObserver(Observer):
         is_busy = work.is_in_turn or backlog > 0
         if not is_busy:
             seen.idle = now
+            seen.learn()
         while seen.unanswered and now - seen.unanswered[0][0] > self.manner.time_to_live:
             seen.unanswered.popleft()
         stood = now - max(seen.since, seen.idle)
@@ -341,14 +359,36 @@ class RuntimeObserver(Observer):
         # A turn that was under way when an ask of it ran out, and still is; or several asks that ran out.
         unanswered = [at for at, made in seen.unanswered if is_busy and seen.since <= max(made, at - self._patience)]
         is_late = keeps_waiting or stands or bool(unanswered) or len(seen.unanswered) > 1
+        since = min((made for _, made in seen.unanswered), default=now - stood)
         return _Shown(
             is_late,
+            since,
             asked_since is not None or bool(seen.unanswered),
             self._is_full(component, cell, now),
             cell.host.mailbox(cell) is not None,
             has_moved,
             has_got_on and work.has_answered and not seen.unanswered,
         )
+
+    def _look_at_place(self, component: str, asked_since: float | None, now: float) -> _Shown:
+        """What is seen where nobody is up: whether those who ask there are left waiting longer than by a usual turn."""
+        seen = self._seen(component)
+        seen.down = now if seen.down is None else seen.down
+        seen.full = None
+        seen.waited.clear()
+        seen.backlog.clear()
+        usual = max(self._patience, LONGER * seen.longest)
+        ran_out = any(made >= seen.down - self._patience for at, made in seen.unanswered if at > seen.down)
+        waits = asked_since is not None and seen.turns >= LOOKS and now - max(asked_since, seen.down) > usual
+        is_late = now - seen.down > usual and (ran_out or waits)
+        return _Shown(is_late, seen.down, True, False, False, False, False)
+
+    def _come_back(self, component: str) -> None:
+        """It is up again: that those who asked had to wait for that says nothing of the life that has begun."""
+        self._seen(component).down = None
+        for atom in (progress(component), replies(component)):
+            if component not in self._loops:
+                self.verdict(atom, None)
 
     def _is_full(self, component: str, cell: Cell, now: float) -> bool:
         """Whether its mailbox has taken nothing for too long."""
@@ -371,9 +411,9 @@ class RuntimeObserver(Observer):
             is_blamed, is_awaited = component in accused, component in awaited
             self._tell_room(component, of_it, is_blamed=is_blamed)
             if is_blamed and (of_it.is_late or is_awaited):
-                self._deny(progress(component))
+                self._deny(progress(component), of_it.since)
                 if of_it.is_asked or is_awaited:
-                    self._deny(replies(component))
+                    self._deny(replies(component), of_it.since)
                 else:
                     self.verdict(replies(component), self._kept(replies(component)))
             elif of_it.is_late or (of_it.is_full and not is_blamed):
@@ -384,7 +424,8 @@ class RuntimeObserver(Observer):
             backlog, was = self._known[component].backlog, self.said(keeps_up(component))
             is_known = None if was is False or component in growing else was
             is_empty = backlog.is_empty and self._known[component].turns > 0
-            self.verdict(keeps_up(component), False if component in overrun else True if is_empty else is_known)
+            holds = False if component in overrun else True if is_empty else is_known
+            self.verdict(keeps_up(component), holds, backlog.since)
         for over in self._waiting - waiting:
             self.verdict(over, None)
         self._waiting = waiting
@@ -411,10 +452,10 @@ class RuntimeObserver(Observer):
         was = self._kept(replies(component))
         self.verdict(replies(component), None if has_refused else True if of_it.has_answered else was)
 
-    def _deny(self, atom: Literal) -> None:
-        """There is a reason to say that it does not hold."""
+    def _deny(self, atom: Literal, since: float | None = None) -> None:
+        """There is a reason to say that it does not hold; `since` is when that began."""
         self._seen(atom.args[0]).denied[atom] = self.now
-        self.verdict(atom, False)
+        self.verdict(atom, False, since)
 
     def _kept(self, atom: Literal) -> bool | None:
         """What was said of it before: that it does not hold only as long as the last reason for that is fresh."""

@@ -84,7 +84,7 @@ class Case:
         advised: the advice for each candidate.
         useless: places of actions that were seen not to help.
         others: when each component was started by somebody else.
-        awaited: whom its supervisor was at work on when repair last looked.
+        awaited: whose supervisor was at work when repair looked, with the number of the life that they had then.
         held: what repair waits for, as it was last told.
         doubted: since when a candidate is blamed although its actors answer.
     """
@@ -104,7 +104,7 @@ class Case:
     useless: set[int] = dataclasses.field(default_factory=set[int])
     others: dict[str, float] = dataclasses.field(default_factory=dict[str, float])
     held: str = ""
-    awaited: set[str] = dataclasses.field(default_factory=set[str])
+    awaited: dict[str, int] = dataclasses.field(default_factory=dict[str, int])
     doubted: dict[tuple[str, ...], float] = dataclasses.field(default_factory=dict[tuple[str, ...], float])
 
     @property

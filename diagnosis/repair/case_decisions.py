@@ -178,8 +178,9 @@ def judge_pings(
 ) -> Decision | None:
     """What to do instead of restarting actors on suspicion; None: restart them.
 
-    Who does not answer is restarted at once. Who answers is restarted when the diagnosis has stood for a while, and
-    never because somebody says that it does not run: that word is seen to be wrong.
+    Who does not answer is restarted at once. Who answers is restarted when the diagnosis has stood for a while, or what
+    shows it has, if nobody else may be faulty; and never because somebody says that it does not run: that word is seen
+    to be wrong.
 
     Args:
         pings: whether their actors answer; None: suspended by order. Of one that is no actor nothing is known.
@@ -191,6 +192,8 @@ def judge_pings(
         case.doubted.pop(bad, None)
         return None
     since = case.doubted.setdefault(bad, at.now)
+    if set(bad) <= set(at.diagnosis.certain):  # Nobody else may be it: what shows it has stood already.
+        since = min(since, at.stood)
     if (left := since + policy.caution.confirm - at.now) > 0:  # What is waited for is what is asked: both round alike.
         return Wait(left)
     down = {one.args[0] for one in at.diagnosis.symptoms if one.name == "running" and not one.positive}

@@ -30,6 +30,7 @@ class CaseView(NamedTuple):
 
     Attributes:
         diagnosed: when the diagnosis came.
+        stood: when the youngest of its symptoms began, as far as its observers know.
         settles: until when no plan is made.
         bad: the candidate to act on.
         given_up: components that are beyond repair.
@@ -47,6 +48,7 @@ class CaseView(NamedTuple):
     given_up: Collection[str] = ()
     stance: Stance = "on"
     is_unsure: bool = False
+    stood: float = math.inf
 
 
 def choose(

@@ -13,6 +13,7 @@ from typing import Final
 from ...supervision.intensity import admit_restart
 from ..engine import Diagnosis, State
 from ..literals import Literal, Vocabulary
+from ..model import Model
 from ..observations import ObservationSet
 
 OURS: Final = 5.0
@@ -31,7 +32,6 @@ class Outlook:
     Attributes:
         diagnosed: when the present diagnosis came.
         graced: until when nobody counts as found bad: what was started has not been seen to work yet.
-        settles: until when no plan is made: somebody else has started something.
         looks_until: until when repair only looks.
         ours: when each component was touched by repair.
         lives: when the last lives of each component began.
@@ -42,7 +42,6 @@ class Outlook:
     diagnosis: Diagnosis = dataclasses.field(default_factory=lambda: Diagnosis(State.BLIND))
     diagnosed: float = -math.inf
     graced: float = -math.inf
-    settles: float = -math.inf
     looks_until: float = -math.inf
     ours: dict[str, float] = dataclasses.field(default_factory=dict[str, float])
     theirs: dict[str, float] = dataclasses.field(default_factory=dict[str, float])
@@ -65,6 +64,27 @@ class Outlook:
         said = {word.literal.positive for word in words if word.is_current(now)}
         return (said.pop() if len(said) == 1 else None), max((word.time for word in words), default=-math.inf)
 
+    def settles(self, model: Model, now: float) -> float:
+        """Until when no plan is made: somebody else has started one who may be faulty, or on whom a symptom depends.
+
+        Whom others ask is no better for a new life of those who ask.
+        """
+        symptoms, suspects = {one.atom for one in self.diagnosis.symptoms}, set(self.diagnosis.suspects)
+        counts = (
+            until
+            for name, until in self.theirs.items()
+            if until > now and (name in suspects or not symptoms.isdisjoint(model.dependents((name,))))
+        )
+        return max(counts, default=-math.inf)
+
+    def stood(self, now: float) -> float:
+        """When the youngest symptom of the present diagnosis began; inf if of one that is not known."""
+        began = -math.inf
+        for symptom in self.diagnosis.symptoms:
+            words = (one for one in self.observations.words(symptom) if one.literal == symptom and one.is_current(now))
+            began = max(began, min((one.since for one in words if one.since is not None), default=math.inf))
+        return began if self.diagnosis.symptoms else math.inf
+
     def note_start(self, components: Iterable[str], seconds: float, now: float) -> bool:
         """Somebody has started components, which takes so long; False if it was repair that did.
 
@@ -73,8 +93,7 @@ class Outlook:
         theirs = [name for name in components if now - self.ours.get(name, -math.inf) > OURS]
         if theirs:
             self.theirs |= dict.fromkeys(theirs, now + seconds)
-            self.settles = max(self.settles, now + seconds)
-            self.graced = max(self.graced, self.settles)
+            self.graced = max(self.graced, now + seconds)
         return bool(theirs)
 
     def note_life(self, components: Iterable[str], seconds: float, now: float) -> bool:

@@ -27,9 +27,11 @@ class Caution:
     """How repair sees to it that nobody is restarted who works.
 
     Attributes:
-        confirm: seconds for which a diagnosis must stand before an actor that answers is restarted.
+        confirm: seconds for which a diagnosis must stand before an actor that answers is restarted; or what shows it,
+            if no candidate leaves that actor out.
         ping: seconds an actor has to answer, or to get on with its turn, before it is restarted.
-        grace: seconds after anybody has started a component in which no plan is made.
+        grace: seconds after anybody has started a component in which no plan is made, if it is suspected, or a symptom
+            depends on it.
     """
 
     confirm: float = 1.0

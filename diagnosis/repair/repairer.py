@@ -155,10 +155,13 @@ class Repairer(Actor):
             return
         if isinstance(event, ChildRestarted):
             self._restarted[event.address.rpartition("/")[0]] = self.now()
-        elif isinstance(event, ActorStarted) and event.life > 1:
+        elif isinstance(event, ActorStarted):
             names = tuple(name for name, address in self._addresses.items() if address == event.address)
-            if names and self._outlook.note_life(names, self._policy.caution.grace, self.now()):
-                self._note_others(names, event.address)
+            # The first life of one who was missed: it was stopped by order, and is there again.
+            is_again = event.life > 1 or not set(names).isdisjoint(self._outlook.diagnosis.suspects)
+            if names and is_again and self._outlook.note_life(names, self._policy.caution.grace, self.now()):
+                if event.life > 1:
+                    self._note_others(names, event.address)
                 self.ctx.ref.tell(_Started())
 
     def _note_others(self, names: Iterable[str], address: str) -> None:
@@ -289,7 +292,10 @@ class Repairer(Actor):
 
     def _begin(self) -> None:
         """Open a case, if there is something to repair and none is open."""
-        if self._memory.stance == "off" or self.now() < max(self._outlook.looks_until, self._outlook.settles):
+        now = self.now()
+        if self._memory.stance == "off" or now < self._outlook.looks_until:
+            return
+        if now < self._outlook.settles(self._model, now):
             return
         if self._case is None and self._chosen(Case(0, 0.0)) is not None:
             self._memory.cases += 1
@@ -332,11 +338,12 @@ class Repairer(Actor):
             self._memory.mode,
             now,
             diagnosed=outlook.diagnosed,
-            settles=outlook.settles,
+            settles=outlook.settles(self._model, now),
             bad=self._chosen(case),
             given_up=self._memory.given_up,
             stance=self._memory.stance,
             is_unsure=is_healthy and deciding.is_unsure(case, self._model, outlook, now),
+            stood=outlook.stood(now),
         )
 
     async def _repair(self, case: Case) -> None:
@@ -387,10 +394,12 @@ class Repairer(Actor):
         at, policy = self._moment(case), self._policy
         case.add_symptoms(at.diagnosis.symptoms)
         if (busy := self._busy(bad)) is not None:
-            case.awaited |= set(bad)
+            case.awaited = {name: self._life(name) for name in bad} | case.awaited
             return deciding.Wait(deciding.SOON, wakes=False) if case.has_heard(busy) else deciding.Enter(held=busy)
-        if back := tuple(sorted(case.awaited & set(bad))):
-            await self._give_time(case, back)
+        awaited = {name: case.awaited.pop(name) for name in sorted(case.awaited.keys() & set(bad))}
+        # Of who ended by itself, and hangs in that, its supervisor has begun nothing.
+        if back := tuple(name for name, life in awaited.items() if self._life(name) != life):
+            await self._give_time(back)
             return deciding.Enter()
         problem = problem_for(self._model, self._actions, policy, self._ledger, at, bad, self._alone(), self._is_free)
         outcome = await find_plan(self._planner, problem, timeout=policy.plan_seconds, degrade=True)
@@ -424,9 +433,13 @@ class Repairer(Actor):
             case.take_back_plan(bad)
         return deciding.judge_results(bad, outcome, results, self.now(), policy)
 
-    async def _give_time(self, case: Case, names: tuple[str, ...]) -> None:
+    def _life(self, component: str) -> int:
+        """The number of the life that a component has, or had last; -1 if there is none to be seen."""
+        cell = self.ctx._cell.node.find(self._addresses.get(component, ""))
+        return -1 if cell is None else cell.life
+
+    async def _give_time(self, names: tuple[str, ...]) -> None:
         """Their supervisor has done its work just now: what was seen while it did says nothing of what has begun."""
-        case.awaited -= set(names)
         grace = self._policy.caution.grace
         self._outlook.note_start(names, grace, self.now())
         await self.ctx.publish(TOUCHED, say.Touched(names, "restart by its supervisor", self.now(), grace))

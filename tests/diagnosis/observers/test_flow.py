@@ -55,11 +55,25 @@ class Sensor(hf.Actor):
             await self.ctx.publish("/out", Item(self.count))
 
 
+class Question(hf.Message[int]):
+    pass
+
+
+class Oracle(hf.Actor):
+    """Thinks long."""
+
+    @hf.on(Question)
+    async def answer(self, message: Question) -> int:
+        await asyncio.sleep(3.0)
+        return 42
+
+
 class Filter(hf.Actor):
     """Publishes each `each`-th, after so many seconds."""
 
     def __init__(self) -> None:
         self.each, self.count, self.seconds = 2, 0, 0.0
+        self.oracle: hf.ActorRef[Oracle] | None = None
 
     @hf.on(Each)
     def set(self, message: Each) -> None:
@@ -69,6 +83,8 @@ class Filter(hf.Actor):
     async def take(self, message: Item) -> None:
         if self.seconds:
             await asyncio.sleep(self.seconds)
+        if self.oracle is not None:
+            await self.oracle.ask(Question())
         self.count += 1
         if self.each and self.count % self.each == 0:
             await self.ctx.publish("/out", message)
@@ -191,6 +207,59 @@ async def test_a_silence_that_was_a_fault_is_found_again(how: str) -> None:
             await flow()
         await asyncio.sleep(5.0)
         assert (said.get(ok("/out")) is False) is (how != "it goes on by itself")
+
+
+@pytest.mark.parametrize(("known", "is_enough"), [(30, False), (400, True)])
+async def test_the_more_is_known_the_less_has_to_come_in_until_silence_is_a_fault(
+    world: World, known: int, is_enough: bool
+) -> None:
+    await world.set_each(1)
+    await world.send(known, 0.1)
+    await world.set_each(0)
+    await world.send(7, 1.0)
+    assert (world.said.get(ok("/out")) is False) is is_enough
+    await world.send(8, 1.0)
+    assert world.said[ok("/out")] is False
+
+
+async def test_behind_a_pause_it_is_silent_from_when_something_comes_in(world: World) -> None:
+    await world.set_each(1)
+    await world.send(400, 0.1)
+    await asyncio.sleep(5.0)
+    world.filter._cell.actor.seconds = 1.5  # type: ignore[union-attr]
+    for _ in range(30):
+        await world.send(1, 0.0)
+    await world.send(5, 0.2)
+    assert ok("/out") not in world.bad
+
+
+async def test_who_is_missed_by_what_has_come_is_so_however_long_that_pauses(world: World) -> None:
+    rng = random.Random(1)
+    await world.set_each(1)
+    await world.send(40, 1.5, burst=20, rng=rng)
+    await world.set_each(0)
+    await world.send(10, 1.0, burst=20)
+    await asyncio.sleep(30.0)
+    assert world.said == {ok("/in"): True, ok("/out"): False}
+
+
+async def test_who_waits_for_a_reply_is_silent_by_that(world: World) -> None:
+    await world.set_each(1)
+    await world.send(400, 0.1)
+    world.filter._cell.actor.oracle = world.system.spawn(hf.start(Oracle))  # type: ignore[union-attr]
+    await world.send(80, 0.1)
+    assert not world.bad
+
+
+async def test_a_burst_however_large_has_no_rhythm() -> None:
+    said: dict[Literal, bool] = {}
+    async with hf.ActorSystem("t", log=False, seed=1) as system:
+        system.spawn(hf.start(Notes, said))
+        arrivals = [("/in", asyncio.get_running_loop().time())] * 100
+        start = hf.start(FlowObserver, MADE, leave_out=(OBSERVATIONS,), arrivals=arrivals)
+        await system.start(observer("topics", start))
+        await asyncio.sleep(60.0)
+        assert said.get(ok("/in")) is None
 
 
 async def test_of_a_topic_of_which_half_is_lost_too_little_goes_out(world: World) -> None:

@@ -79,6 +79,16 @@ class Worker(hf.Actor):
         return 1
 
 
+class Late(Worker):
+    """Its start takes until a gate is open."""
+
+    def __init__(self, gate: asyncio.Event) -> None:
+        self._gate = gate
+
+    async def on_start(self, restored: bool) -> None:
+        await self._gate.wait()
+
+
 @pytest.fixture
 async def system() -> AsyncIterator[hf.ActorSystem]:
     async with hf.ActorSystem("t", log=False, seed=1) as running:
@@ -252,6 +262,50 @@ async def test_who_rests_in_its_turn_as_it_has_said_is_not_accused_by_who_tells_
     await asking
     assert keeps_up("uploader") not in await told_steadily(uploader, 20.0, watching)
     assert (await watching.observed()).negative == frozenset()
+
+
+async def test_turns_that_only_get_longer_are_no_measure_for_the_next_one(system: hf.ActorSystem) -> None:
+    watching, tired = await watched(system), worker(system, "a")
+    for turn in range(1, 9):
+        tired.tell(Go(f"long {0.3 * turn}"))
+    against: set[Literal] = set()
+    for _ in range(80):
+        await advance(0.1)
+        against |= (await watching.observed()).negative
+    assert against == {progress("all/a")}
+
+
+async def test_how_long_its_turns_have_taken_is_usual_when_it_has_come_to_their_end(system: hf.ActorSystem) -> None:
+    watching, slow = await watched(system), worker(system, "a")
+    slow.tell(Go("long 0.9"))
+    await advance(2.0)
+    for _ in range(5):
+        slow.tell(Go("long 3.2"))
+    for _ in range(170):
+        await advance(0.1)
+        assert not (await watching.observed()).negative
+
+
+async def test_who_is_asked_and_does_not_come_back_is_named_by_those_who_wait(system: hf.ActorSystem) -> None:
+    """Its start hangs: that is seen before anybody has looked twice whether it runs."""
+    gate = asyncio.Event()
+    gate.set()
+    keeper = system.ref("/t/all", hf.Supervisor)
+    await keeper.ask(hf.StartChild(hf.child("late", hf.start(Late, gate))))
+    watching = await diagnosis.watch(system, seconds=0.1)
+    late, asker = system.ref("/t/all/late", Late), worker(system, "a")
+    for _ in range(40):
+        await asker.ask(Go("ask /t/all/late"))
+        await advance(0.1)
+    gate.clear()
+    late.tell(Go("crash"))
+    asker.tell(Go("ask /t/all/late"))
+    await advance(2.1)  # A start is given a second by whoever looks at it.
+    assert {progress("all/late"), replies("all/late")} <= (await watching.observed()).negative
+    assert (await watching.diagnosis()).certain == ("all/late",)
+    gate.set()
+    await advance(3.0)
+    assert (await watching.diagnosis()).state is State.HEALTHY
 
 
 async def test_that_it_does_not_answer_is_unknown_again_when_the_last_reason_is_old(system: hf.ActorSystem) -> None:

@@ -14,6 +14,7 @@ LOOP = "tests/diagnosis/repair/test_loop.py"
 WORSE = "tests/diagnosis/repair/test_no_worse.py"
 
 KILLS = "tests/checkpoint/test_kill_counts.py"
+SOON = "tests/diagnosis/repair/test_soon.py"
 HUNG = "tests/diagnosis/repair/test_hung_turns.py"
 
 CHECKS = {
@@ -201,10 +202,45 @@ CHECKS = {
     ),
     "what its supervisor has just started is given time": Check(
         "diagnosis/repair/repairer.py",
-        "        if back := tuple(sorted(case.awaited & set(bad))):\n",
+        "        if back := tuple(name for name, life in awaited.items() if self._life(name) != life):\n",
         "        if back := tuple[str, ...]():\n",
         WORSE,
         "test_repair_is_no_worse_than_supervision_alone and slow",
+    ),
+    "who hangs in its end is given no time to begin": Check(
+        "diagnosis/repair/repairer.py",
+        "if back := tuple(name for name, life in awaited.items() if self._life(name) != life):",
+        "if back := tuple(awaited):",
+        SOON,
+        "hangs_in_its_end",
+    ),
+    "what has stood when it is told need not stand once more": Check(
+        "diagnosis/repair/case_decisions.py",
+        "        since = min(since, at.stood)\n",
+        "        pass\n",
+        SOON,
+        "falls_silent",
+    ),
+    "while another one may be faulty the diagnosis has to stand": Check(
+        "diagnosis/repair/case_decisions.py",
+        "if set(bad) <= set(at.diagnosis.certain):",
+        "if True:",
+        SOON,
+        "must_have_stood",
+    ),
+    "what began a moment ago has to stand, also if somebody is certain": Check(
+        "diagnosis/repair/outlook.py",
+        "default=math.inf))\n        return began",
+        "default=-math.inf))\n        return began",
+        SOON,
+        "must_have_stood",
+    ),
+    "that those who ask are started again delays nobody": Check(
+        "diagnosis/repair/outlook.py",
+        "if until > now and (name in suspects or not symptoms.isdisjoint(model.dependents((name,))))",
+        "if until > now",
+        SOON,
+        "delays_nobody",
     ),
     "a client of the board that has said nothing for the longest time gives its seat to a new one": Check(
         "diagnosis/board/tcp_server.py",
