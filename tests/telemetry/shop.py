@@ -38,7 +38,7 @@ class Careless(hf.Actor):
         self.helper.stop()
         return self.asked
 
-    def on_down(self, ref: hf.ActorRef, reason: hf.ExitReason, recovering: bool) -> None:
+    def on_down(self, source: hf.ActorRef, reason: hf.ExitReason, recovering: bool) -> None:
         assert self.asked is not None
         self.asked.reply(None)
 
