@@ -26,6 +26,8 @@ RECOVERING = "recovering"
 STOPPING = "stopping"
 WITH_THE_SYSTEM = "the system has ended"
 """Why a child has ended, in the words of `ChildStopped`, whose supervisor has ended with the whole system."""
+WITH_SUPERVISOR = "its supervisor has ended"
+"""Why a child has ended, in those words, whose supervisor has ended for another reason."""
 
 
 @dataclasses.dataclass(slots=True, eq=False)
@@ -152,12 +154,15 @@ def tell_stopped(cell: Cell, by: str, because: str) -> None:
 
 
 def tell_ended_with(cell: Cell, above: str) -> None:
-    """Tell that a child has ended because its supervisor at `above` has: perhaps because the whole system does."""
-    root = cell.node.root
-    if root is not None and root.state is not RUNNING:
+    """Tell that a child has ended because its supervisor at `above` has: perhaps because the whole system does.
+
+    In a process of a supervisor nobody knows of the system: its history does.
+    """
+    node = cell.node
+    if node.ports.uplink is None and node.root is not None and node.root.state is not RUNNING:
         tell_stopped(cell, "", WITH_THE_SYSTEM)
     else:
-        tell_stopped(cell, above, "its supervisor has ended")
+        tell_stopped(cell, above, WITH_SUPERVISOR)
 
 
 class StartRow:

@@ -8,7 +8,9 @@ from heapq import merge
 from typing import TYPE_CHECKING
 
 from ...actors.events import ActorKilled, ActorStarted, ChildStopped, ChildTerminated, Event, LogLine, Restful
+from ...actors.kernel.cell import RUNNING
 from ...checkpoint.addresses import is_at
+from ...supervision.children import WITH_SUPERVISOR, WITH_THE_SYSTEM
 from ..last_lines.followers import Followers
 from ..last_lines.line_memory import LineMemory
 from .authors import author
@@ -93,11 +95,19 @@ class HistoryRecorder:
             by, because = self._expected.pop(event.address)
             fields["by"] = fields.get("by") or by
             fields["because"] = fields.get("because") or because
+        if kind is ChildStopped and fields["because"] == WITH_SUPERVISOR and self._is_ending:
+            fields["by"], fields["because"] = "", WITH_THE_SYSTEM  # Its supervisor has a process, and did not know.
         if kind is ActorKilled:
-            fields["by"] = fields["by"] or author()
+            fields["by"] = fields["by"] or self._expected.get(event.address, (author(), ""))[0]
         if kind.__name__ in COUNTED:
             fields |= count_work(self._node, event.address)
         self._add(kind.__name__, event.address, fields)
+
+    @property
+    def _is_ending(self) -> bool:
+        """Whether the whole system ends."""
+        root = self._node.root
+        return root is not None and root.state is not RUNNING
 
     def _is_counted(self, event: Event) -> bool:
         """Whether an event is one of many that are alike: a row says in a while how many there were."""

@@ -86,6 +86,58 @@ def test_a_start_that_fails_is_a_life_that_did_not_begin() -> None:
     assert (only.number, only.started, only.reason_kind) == (1, None, "StartFailed")
 
 
+def test_a_process_that_is_ended_before_its_actor_has_begun_is_no_life() -> None:
+    killed = {"reason": "killed", "reason_kind": "Killed"}
+    assert lives_of(("ProcessStarted", {"pid": 71}), ("ProcessDied", {"pid": 71, **killed})) == []
+    [only] = lives_of(
+        ("ProcessStarted", {"pid": 71}),
+        ("ProcessDied", {"pid": 71, **killed}),
+        ("ChildStartFailed", {"reason": "no class"}),
+    )
+    assert (only.number, only.reason, only.reason_kind) == (1, "no class", "StartFailed")
+    [told] = lives_of(
+        ("ProcessStarted", {"pid": 71}), ("ActorKilled", {"by": "/app"}), ("ProcessDied", {"pid": 71, **killed})
+    )
+    assert (told.by, told.reason_kind) == ("/app", "Killed")
+
+
+def test_turns_that_a_life_has_done_before_it_is_told_of_are_its_own() -> None:
+    crash = {"reason": "KeyError: 7", "reason_kind": "Crash", "restarts": 0, "allowed": 3}
+    first, second, third = lives_of(
+        ("ActorStarted", {"life": 1, "turns": 0}),
+        ("ActorCrashed", {"life": 1, "turns": 4, **crash}),
+        ("ChildTerminated", {"turns": 4, **crash}),
+        ("ActorCrashed", {"life": 2, "turns": 5, **crash}),  # It had ended before its start was told.
+        ("ChildTerminated", {"turns": 5, **crash}),
+        ("ActorStarted", {"life": 3, "turns": 7}),
+        ("ChildStopped", {"life": 3, "turns": 8}),
+    )
+    assert (first.turns, second.turns, third.turns) == (4, 1, 3)
+
+
+def test_a_life_ends_with_the_one_above_it() -> None:
+    lives = LivesByAddress()
+
+    def tell(number: int, kind: str, address: str, **fields: Any) -> None:
+        lives.apply(PastEvent(number, float(number), kind, address, fields))
+
+    crash = {"reason": "KeyError: 7", "reason_kind": "Crash"}
+    for number, address in enumerate(("/app", "/app/s", "/app/s/t", "/app/s/t/one"), 1):
+        tell(number, "ActorStarted", address, life=1)
+    assert not lives.at("/app/s/t/one")[0].is_over
+    tell(5, "ChildTerminated", "/app/s", **crash, restarts=0, allowed=3)
+    [one], [above] = lives.at("/app/s/t/one"), lives.at("/app/s/t")
+    assert (one.ended, one.reason, one.by, one.because) == (5.0, "KeyError: 7", "/app/s/t", "its supervisor has ended")
+    assert (above.ended, above.by) == (5.0, "/app/s")
+    tell(6, "ActorStarted", "/app/s/t/one", life=1)  # Who is above it tells of its start when that is over.
+    tell(7, "ActorStarted", "/app/s/t", life=1)
+    tell(8, "ActorStarted", "/app/s", life=2)
+    assert [[life.is_over for life in lives.at(path)] for path in ("/app/s", "/app/s/t", "/app/s/t/one")] == [
+        [True, False]
+    ] * 3
+    assert not lives.at("/app")[0].is_over
+
+
 def test_who_has_ended_a_life() -> None:
     by = {"reason": "shutdown", "reason_kind": "Shutdown", "by": "/app", "because": "order"}
     [stopped] = lives_of(("ActorStarted", {"life": 1}), ("ChildStopped", {"life": 1, **by}))
