@@ -8,8 +8,6 @@ from collections.abc import Sequence
 from itertools import islice
 from typing import TYPE_CHECKING, Any
 
-import msgspec
-
 from ...actors.control.orders import Status
 from ...actors.errors import AskTimeout, HoldfastError, NoSuchActor, SpecError
 from ...actors.kernel.node import cell_kind
@@ -167,7 +165,7 @@ class HistoryCalls:
         itself, state, others = await asyncio.gather(
             self._ask_itself(cell, timeout), self._ask_above(above, timeout), self._ask_below(cell, timeout)
         )
-        return msgspec.structs.replace(itself, above=state, below=others)
+        return Told(itself.status, itself.queued_before, itself.overview, itself.silence, state, others)
 
     async def _ask_itself(self, cell: Cell, timeout: float) -> Told:
         """What an actor says of itself; if several messages wait, what it said a moment before, too."""

@@ -8,7 +8,7 @@ from typing import TypeAlias
 
 import msgspec
 
-from ...supervision.children import WITH_SUPERVISOR, WITH_THE_SYSTEM
+from ...supervision.children import WITH_SUPERVISOR
 from .authors import PROGRAM
 from .past_event import PastEvent, Plain
 from .paths import is_part
@@ -18,6 +18,8 @@ MOST_LIVES = 16
 MOST_ADDRESSES = 10_000
 """Addresses whose lives are kept; beyond, whoever had nothing happen for longest is forgotten."""
 
+WITH_THE_SYSTEM = "the system has ended"
+"""Why a life has ended, in words, whose supervisor has ended with the whole system."""
 KILLED_BY_REF = "it was killed by `ref.kill()`"
 """Why a life has ended that somebody has killed, in words."""
 

@@ -138,6 +138,22 @@ def test_a_life_ends_with_the_one_above_it() -> None:
     assert not lives.at("/app")[0].is_over
 
 
+def test_a_life_that_begins_anew_has_ended_with_the_one_above_it() -> None:
+    lives = LivesByAddress()
+    for number, (kind, address) in enumerate(
+        [
+            ("ActorStarted", "/app/s"),
+            ("ActorStarted", "/app/s/one"),
+            ("ChildStopped", "/app/s"),
+            ("ActorStarted", "/app/s/one"),
+            ("ActorStarted", "/app/s"),
+        ]
+    ):
+        lives.apply(PastEvent(number, float(number), kind, address, {"life": 1, "by": "/app", "because": "order"}))
+    first, second = lives.at("/app/s/one")
+    assert (first.ended, first.by, second.started, second.is_over) == (2.0, "/app/s", 3.0, False)
+
+
 def test_who_has_ended_a_life() -> None:
     by = {"reason": "shutdown", "reason_kind": "Shutdown", "by": "/app", "because": "order"}
     [stopped] = lives_of(("ActorStarted", {"life": 1}), ("ChildStopped", {"life": 1, **by}))
