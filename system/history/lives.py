@@ -158,7 +158,7 @@ class LivesByAddress:
                 self._known.popitem(last=False)
         else:
             self._known.move_to_end(event.address)
-            if event.kind in BEGINNINGS:
+            if event.kind in BEHIND_AN_END:
                 self._end_with_above(event.address)
         learn(lives, event)
         if not lives:
@@ -184,16 +184,9 @@ class LivesByAddress:
 
 def _now(lives: Lives) -> PastLife:
     """The life that goes on; if none is known to, one that has begun unseen."""
-    if not lives:
-        lives.append(PastLife(1))
-    elif lives[-1].is_over:
-        lives.append(PastLife(lives[-1].number + 1, turns_before=_turns_up_to(lives[-1])))
+    if not lives or lives[-1].is_over:
+        lives.append(PastLife(lives[-1].number + 1 if lives else 1))
     return lives[-1]
-
-
-def _turns_up_to(life: PastLife) -> int | None:
-    """The turns at the address up to the end of a life; None if nobody has counted them."""
-    return None if life.turns is None or life.turns_before is None else life.turns_before + life.turns
 
 
 def _last(lives: Lives) -> PastLife:
@@ -238,15 +231,15 @@ def _slow(lives: Lives, event: PastEvent) -> None:
 
 def _started(lives: Lives, event: PastEvent) -> None:
     number = _number(event, "life") or 1
-    if lives and not lives[-1].is_over and lives[-1].started is not None:
+    if lives and not lives[-1].is_over:
         life = lives[-1]
+        if life.started is None:
+            life.number, life.started, life.turns_before = number, event.at, _number(event, "turns")
+            return
         if life.number == number:
             return  # A replica of the same life.
         life.ended, life.reason = event.at, life.reason or "its end was not recorded"
-    life, turns = _now(lives), _number(event, "turns")
-    life.number, life.started = number, event.at
-    if turns is not None:  # It is told when the life may have done some of its own already.
-        life.turns_before = turns if life.turns_before is None else min(turns, life.turns_before)
+    lives.append(PastLife(number, event.at, turns_before=_number(event, "turns")))
 
 
 def _process_started(lives: Lives, event: PastEvent) -> None:
@@ -345,7 +338,8 @@ def _quarantined(lives: Lives, event: PastEvent) -> None:
     """The processes that have died in a row had this message in hand."""
     left = _number(event, "deliveries") or 1
     for life in reversed(lives):
-        if left and life.reason_kind in DEATHS:
+        is_dying = not life.is_over and life.started is not None  # Of replicas the end is told behind this.
+        if left and (life.reason_kind in DEATHS or is_dying):
             life.handling = life.handling or _text(event, "message")
             left -= 1
 
@@ -362,8 +356,8 @@ def _root_ended(lives: Lives, event: PastEvent) -> None:
 WITH_THE_ROOT = frozenset({"SystemStopped", "RootKilled"})
 """How lives end that end with the process of the root."""
 ROOT = ("SystemStarted", "SystemStopped")
-BEGINNINGS = ("ActorStarted", "ProcessStarted")
-"""Events with which a life begins at an address: the one before it is over."""
+BEHIND_AN_END = ("ActorStarted", "ProcessStarted", "MessageQuarantined")
+"""Events that come when the life before is over."""
 DEATHS = frozenset({"Signal", "ForkServerDied", "Exited", "OutOfMemory", "Hung"})
 """Exit reasons of a process that says nothing itself of what it had in hand."""
 LEARN = {

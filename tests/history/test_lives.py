@@ -72,6 +72,14 @@ def test_a_message_in_quarantine_is_what_the_dead_had_in_hand() -> None:
         ("MessageQuarantined", {"message": "shop.Buy", "deliveries": 2}),
     )
     assert [life.handling for life in lives] == ["", "shop.Buy", "shop.Buy"]
+    first, second = lives_of(
+        ("ActorStarted", {"life": 1}),
+        ("ChildTerminated", SIGKILL),
+        ("ActorStarted", {"life": 2}),
+        ("MessageQuarantined", {"message": "shop.Buy", "deliveries": 2}),
+        ("ChildTerminated", SIGKILL),  # of the last replica
+    )
+    assert (first.handling, second.handling, second.reason_kind) == ("shop.Buy", "shop.Buy", "Signal")
 
 
 def test_a_start_that_fails_is_a_life_that_did_not_begin() -> None:
@@ -99,20 +107,6 @@ def test_a_process_that_is_ended_before_its_actor_has_begun_is_no_life() -> None
         ("ProcessStarted", {"pid": 71}), ("ActorKilled", {"by": "/app"}), ("ProcessDied", {"pid": 71, **killed})
     )
     assert (told.by, told.reason_kind) == ("/app", "Killed")
-
-
-def test_turns_that_a_life_has_done_before_it_is_told_of_are_its_own() -> None:
-    crash = {"reason": "KeyError: 7", "reason_kind": "Crash", "restarts": 0, "allowed": 3}
-    first, second, third = lives_of(
-        ("ActorStarted", {"life": 1, "turns": 0}),
-        ("ActorCrashed", {"life": 1, "turns": 4, **crash}),
-        ("ChildTerminated", {"turns": 4, **crash}),
-        ("ActorCrashed", {"life": 2, "turns": 5, **crash}),  # It had ended before its start was told.
-        ("ChildTerminated", {"turns": 5, **crash}),
-        ("ActorStarted", {"life": 3, "turns": 7}),
-        ("ChildStopped", {"life": 3, "turns": 8}),
-    )
-    assert (first.turns, second.turns, third.turns) == (4, 1, 3)
 
 
 def test_a_life_ends_with_the_one_above_it() -> None:

@@ -437,10 +437,6 @@ async def test_the_turns_of_a_life(system: hf.ActorSystem) -> None:
             await failed(ref, "crash")
         await ref.ask(Do("well"))
     assert [life.turns for life in system.lives(recorded)] == [4, 3, 1]
-    for _ in range(2):
-        await failed(recorded, "crash")
-        await recorded.ask(Do("well"))  # It is handled before the start of that life is told.
-    assert [life.turns for life in system.lives(recorded)] == [4, 3, 2, 2, 1]
     assert [life.turns for life in system.lives(plain)] == [None, None, None]
     assert [life.turns for life in system.lives(counted)] == [
         None,
