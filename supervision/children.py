@@ -11,7 +11,7 @@ from typing import Any
 from ..actors.errors import NoSuchActor, StartFailed, type_name
 from ..actors.events import ChildStopped
 from ..actors.exit_reasons import ExitReason
-from ..actors.kernel.cell import RUNNING, Cell
+from ..actors.kernel.cell import Cell
 from ..actors.kernel.envelope import Item
 from ..actors.persistence import is_in_vain
 from .admin import ChildInfo
@@ -24,8 +24,8 @@ UP = "running"
 RESTARTING = "restarting"
 RECOVERING = "recovering"
 STOPPING = "stopping"
-WITH_THE_SYSTEM = "the system has ended"
-"""Why a child has ended, in the words of `ChildStopped`, whose supervisor has ended with the whole system."""
+WITH_SUPERVISOR = "its supervisor has ended"
+"""Why a child has ended, in the words of `ChildStopped`, that was stopped by its supervisor at its own end."""
 
 
 @dataclasses.dataclass(slots=True, eq=False)
@@ -149,15 +149,6 @@ def tell_stopped(cell: Cell, by: str, because: str) -> None:
     node = cell.node
     if node.events.has_listeners:
         node.emit(ChildStopped(cell.path, cell.life, cell.extra().reason, by, because))
-
-
-def tell_ended_with(cell: Cell, above: str) -> None:
-    """Tell that a child has ended because its supervisor at `above` has: perhaps because the whole system does."""
-    root = cell.node.root
-    if root is not None and root.state is not RUNNING:
-        tell_stopped(cell, "", WITH_THE_SYSTEM)
-    else:
-        tell_stopped(cell, above, "its supervisor has ended")
 
 
 class StartRow:

@@ -25,7 +25,7 @@ from ..actors.persistence import child_key, is_in_vain, plan_key
 from ..actors.process.resource_limits import Limits
 from .admin import AlreadyStarted, DeleteChild, MaxChildren, NotSupported, RestartChild, StartChild, opened
 from .awaited import EACH_LOOK, LOOK_AGAIN, TELL_AFTER, lives, not_there, tell_wait
-from .children import RESTARTING, STARTING, Child, StartRow, complete, expect, tell_ended_with
+from .children import RESTARTING, STARTING, WITH_SUPERVISOR, Child, StartRow, complete, expect, tell_stopped
 from .noted import (
     FIELDS,
     Noted,
@@ -405,7 +405,7 @@ async def stop_together(cells: list[Cell]) -> None:
             if cell.spec is not None:
                 cell.spec.judge(cell, SHUTDOWN, ended)
             if above is not None:
-                tell_ended_with(cell, above.path)
+                tell_stopped(cell, above.path, WITH_SUPERVISOR)
             lifecycle.retire_with_parent(cell)
     finally:
         for timer in timers:

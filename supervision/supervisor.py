@@ -41,6 +41,7 @@ from .children import (
     STOPPED,
     STOPPING,
     UP,
+    WITH_SUPERVISOR,
     Child,
     RestartAgain,
     StartLimit,
@@ -50,7 +51,6 @@ from .children import (
     bind_expected,
     complete,
     new_cell,
-    tell_ended_with,
     tell_stopped,
 )
 from .decisions import affected, decide, is_reported
@@ -670,7 +670,7 @@ class Supervisor(Inquiries):
                 is_living = child.state not in (DOWN, GONE)
                 await child.node.stop_child(child)
                 if is_living and child.parent is self.ctx._cell:
-                    tell_ended_with(child, self.ctx.path)
+                    tell_stopped(child, self.ctx.path, WITH_SUPERVISOR)
 
     def _is_parked(self, name: str) -> bool:
         """Whether this child was stopped by order, and not started since; also if it is forgotten by now."""

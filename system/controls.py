@@ -53,6 +53,7 @@ from ..supervision.respec import respec
 from ..supervision.spec import ChildSpec, Isolation
 from ..supervision.supervisor import Supervisor
 from .history.authors import author
+from .history.lives import KILLED_BY_REF
 from .history.recorder import HistoryRecorder, expect_end
 from .live_moves import BETWEEN_TURNS, Moves, check_isolation, why_not_left
 from .transaction.errors import TransactionFailed
@@ -343,6 +344,7 @@ class Controls:
         check_seconds(cell.path, "timeout", timeout)
         gone = cell.ended()
         if reason == KILLED:
+            expect_end(self._history, cell.path, KILLED_BY_REF)
             cell.ref.kill()
         else:
             expect_end(self._history, cell.path, "it was terminated")

@@ -116,9 +116,9 @@ def run(
     orphans; if other threads run already it does not, and gives a RuntimeWarning.
 
     Raises:
-        SpecError: an event loop runs in this thread already, as in a notebook; `again` was given a coroutine, which
-            can run only once; `standstill` is no such number; or the program has no `if __name__ == "__main__":` and
-            is being imported for the classes of its actors.
+        SpecError: an event loop runs in this thread already, as in a notebook, or it is not the main thread; `again`
+            was given a coroutine, which can run only once; `standstill` is no such number; or the program has no
+            `if __name__ == "__main__":` and is being imported for the classes of its actors.
         KeyboardInterrupt: it was ended by SIGINT.
         SystemExit: it was ended by SIGTERM (with code 143, as a shell reports it).
     """
@@ -132,10 +132,14 @@ def run(
     if again and not callable(main):
         main.close()
         raise SpecError("hf.run", "again=True needs the function: hf.run(main, again=True), not main()")
+    problem = ""
     if asyncio._get_running_loop() is not None:
+        problem = "an event loop runs here already (a notebook, or another framework's): await the coroutine there"
+    elif threading.current_thread() is not threading.main_thread():
+        problem = "only the main thread hears of signals: in this one use asyncio.run"
+    if problem:
         if not callable(main):
             main.close()
-        problem = "an event loop runs here already (a notebook, or another framework's): await the coroutine there"
         raise SpecError("hf.run", problem)
     leave_init()
     stopped_by: list[int] = []

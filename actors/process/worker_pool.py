@@ -615,7 +615,8 @@ class Workers:
         elif event is not None:
             events = self.node.events
             if events.hears_lines if isinstance(event, LogLine) else events.has_listeners:
-                self.node.emit(event)
+                # In nobody's name: this may run in that of the supervisor that has made the process.
+                self.node.base_context.copy().run(self.node.emit, event)
 
     def processes(self) -> dict[str, int]:
         """The pid of each actor's process, by address."""

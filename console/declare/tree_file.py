@@ -40,6 +40,8 @@ ACTOR: Final = (
     "running",
     "names",
 )
+NAMED_ANEW: Final = {"register": "names", "autostart": "running"}
+"""What a child spec has under another name than a file."""
 OF_ONE_SPEC: Final = ("name", "kind", "children", "strategy", "id", "start")
 """Keys at the top of a file for `hf.load_tree`."""
 STRATEGIES: Final = ("one_for_one", "one_for_all", "rest_for_one")
@@ -59,17 +61,19 @@ class TreeFile:
         except tomllib.TOMLDecodeError as error:  # It says line and column.
             raise SpecError(name, str(error)) from error
         below = tables.pop("below", None)
+        if below is not None and not (isinstance(below, str) and _is_address(below)):
+            raise self.error("below", f'it must be an address such as "/app/bank", not {below!r}')
         self.actors: dict[str, WantedActor] = {}
         for path, table in tables.items():
             if path in OF_ONE_SPEC:
                 problem = "this is one supervisor as hf.load_tree reads it, for system.start: here is"
                 raise self.error(path, f'{problem} a table for each address, ["/app/bank"], of the whole tree')
-            if not isinstance(table, dict) or not path.startswith("/"):
+            if not isinstance(table, dict) or not _is_address(path):
                 raise self.error(path, 'there are `below = "/app"`, and tables named for an address: ["/app/bank"]')
-            self.actors[path] = self._read(path.rstrip("/"), cast("dict[str, Any]", table))
+            self.actors[path] = self._read(path, cast("dict[str, Any]", table))
         if not self.actors:
             raise SpecError(name, 'it names no actor: write a table for each, such as ["/app/bank"]')
-        self.below = below if isinstance(below, str) else "/" + next(iter(self.actors)).split("/")[1]
+        self.below = below or "/" + next(iter(self.actors)).split("/")[1]
         self._check()
 
     def error(self, path: str, problem: str, key: str | None = None) -> SpecError:
@@ -124,6 +128,8 @@ class TreeFile:
             problem = error.problem if isinstance(error, (SpecError, DamagedValue)) else str(error)
             if isinstance(error, SpecError) and error.where.startswith(self._name):
                 raise
+            for word, key in NAMED_ANEW.items():
+                problem = key + problem.removeprefix(word) if problem.startswith(word) else problem
             raise self.error(path, problem, next((key for key in given if key in problem), None)) from error
         flags = spec.start.args[0] if is_supervisor else None
         return WantedActor(path, spec, flags=flags, names=tuple(self._texts(path, "names", given.get("names", []))))
@@ -203,4 +209,10 @@ class TreeFile:
     def _texts(self, path: str, key: str, value: object) -> list[str]:
         if not isinstance(value, list) or not all(isinstance(one, str) for one in value):
             raise self.error(path, f"{key} must be a list of texts, not {value!r}", key)
+        if len(set(value)) < len(value):
+            raise self.error(path, f"{key} must have each text once, not {value!r}", key)
         return cast("list[str]", value)
+
+
+def _is_address(path: str) -> bool:
+    return path.startswith("/") and not path.endswith("/")

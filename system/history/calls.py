@@ -5,16 +5,18 @@ from __future__ import annotations
 import asyncio
 import os
 from collections.abc import Sequence
+from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 from ...actors.control.orders import Status
 from ...actors.errors import AskTimeout, HoldfastError, NoSuchActor, SpecError
 from ...actors.kernel.node import cell_kind
 from ...actors.kernel.ref import DEFAULT_TIMEOUT, ActorRef, Target
+from ...actors.process.wire.peer import OutsideHost
 from ...actors.seconds import check_seconds
 from ...supervision.supervisor import Supervisor
 from .counted_work import count_work
-from .evidence import Evidence, PutAside, Silence, Told, collect, put_aside, silence_of
+from .evidence import Evidence, PutAside, Silence, Told, below, collect, put_aside, silence_of
 from .lives import PastLife, done
 from .pages import MOST_ON_PAGE, HistoryPage, HistoryQuestion, answer, question
 from .paths import pattern_of
@@ -22,6 +24,7 @@ from .recorder import HistoryRecorder
 from .why import Cause, causes, why
 
 if TYPE_CHECKING:
+    from ...actors.kernel.cell import Cell
     from ...actors.kernel.node import Node
     from ...checkpoint.home.quarantine import QuarantinedMessage
 
@@ -29,6 +32,10 @@ SEVERAL = 20
 """Messages in a mailbox from which on it is looked at twice."""
 BETWEEN = 0.2
 """Seconds between the two looks."""
+MOST_ASKED = 100
+"""Actors below a supervisor, in other processes, that are asked how they are."""
+ASKED_WITHIN = 1.0
+"""Seconds that each of them may take, and a supervisor in another process."""
 
 
 class HistoryCalls:
@@ -139,7 +146,7 @@ class HistoryCalls:
         check_seconds(call, "timeout", timeout)
         path = _path(target)
         node, recorder = self._node, self._recorder
-        return collect(node, recorder, path, await self._ask_itself(path, timeout), self.quarantined(path))
+        return collect(node, recorder, path, await self._ask(path, timeout), self.quarantined(path))
 
     def put_aside(self, target: Target | None = None) -> list[PutAside]:
         """The messages in quarantine as plain data, oldest first; what is in them only with `log_payloads`.
@@ -149,11 +156,19 @@ class HistoryCalls:
         payloads = self._history is not None and self._history.keeps_payloads
         return [put_aside(one, payloads=payloads) for one in self.quarantined(target)]
 
-    async def _ask_itself(self, path: str, timeout: float) -> Told:
-        """What an actor says of itself; if several messages wait, what it said a moment before, too."""
+    async def _ask(self, path: str, timeout: float) -> Told:
+        """What an actor says of itself, and those above and below it that live in other processes."""
         cell = self._node.find(path)
         if cell is None:
             return Told()
+        above = self._node.find(path.rpartition("/")[0])
+        itself, state, others = await asyncio.gather(
+            self._ask_itself(cell, timeout), self._ask_above(above, timeout), self._ask_below(cell, timeout)
+        )
+        return Told(itself.status, itself.queued_before, itself.overview, itself.silence, state, others)
+
+    async def _ask_itself(self, cell: Cell, timeout: float) -> Told:
+        """What an actor says of itself; if several messages wait, what it said a moment before, too."""
         try:
             status = await self.get_status(cell.ref, timeout=timeout)
             before = None
@@ -165,13 +180,34 @@ class HistoryCalls:
             return Told(silence=self._silence(cell.ref, timeout))
         except HoldfastError:
             return Told()  # It has ended meanwhile: the rest is known all the same.
-        kind = cell_kind(cell)
-        if kind is None or not issubclass(kind, Supervisor):
+        if not _supervises(cell):
             return Told(status, before)
         try:
             return Told(status, before, await self.get_state(cell.ref, timeout=timeout))
         except HoldfastError:
             return Told(status, before)  # It has a turn in hand that does not end: its status says so.
+
+    async def _ask_above(self, cell: Cell | None, timeout: float) -> dict[str, Any]:
+        """The state of a supervisor that lives in another process; empty if it does not, or does not say."""
+        if cell is None or not _is_elsewhere(cell) or not _supervises(cell):
+            return {}
+        try:
+            state: dict[str, Any] = await self.get_state(cell.ref, timeout=min(timeout, ASKED_WITHIN))
+        except HoldfastError:
+            return {}
+        return state
+
+    async def _ask_below(self, cell: Cell, timeout: float) -> dict[str, Status]:
+        """How those are that live below a supervisor in other processes, by address, as far as they say."""
+        far = islice((one for one in below(cell) if _is_elsewhere(one)), MOST_ASKED) if _supervises(cell) else ()
+        told = await asyncio.gather(*(self._ask_status(one, min(timeout, ASKED_WITHIN)) for one in far))
+        return {status.address: status for status in told if status is not None}
+
+    async def _ask_status(self, cell: Cell, timeout: float) -> Status | None:
+        try:
+            return await self.get_status(cell.ref, timeout=timeout)
+        except HoldfastError:
+            return None
 
     def _silence(self, ref: ActorRef[Any], seconds: float) -> Silence | None:
         """That the process of an actor has not answered; None if it lives in this one, or nowhere at the moment."""
@@ -186,6 +222,16 @@ class HistoryCalls:
         if self._history is None:
             raise SpecError("history", "the system keeps none: it was made with history=False, or is not running")
         return self._history
+
+
+def _supervises(cell: Cell) -> bool:
+    kind = cell_kind(cell)
+    return kind is not None and issubclass(kind, Supervisor)
+
+
+def _is_elsewhere(cell: Cell) -> bool:
+    """Whether another process knows more of an actor than this one."""
+    return not cell.is_dead and (isinstance(cell.host, OutsideHost) or cell.host.place.process(cell) is not None)
 
 
 def _path(target: Target) -> str:

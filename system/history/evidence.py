@@ -22,10 +22,10 @@ from ...supervision.children import STOPPED
 from ...supervision.intensity import recent_restarts
 from ...supervision.spec import ChildSpec
 from ...supervision.supervisor import IN_VAIN, Supervisor, listed_at
-from .lives import WITH_THE_ROOT, PastLife, is_fault
+from .lives import WITH_THE_ROOT, PastLife, is_deeper, is_fault
 from .pages import answer, question
 from .past_event import PastEvent, content, message_type, shortened
-from .paths import literal
+from .paths import PARTS, is_part, literal
 
 if TYPE_CHECKING:
     from ...actors.kernel.cell import Cell
@@ -52,10 +52,8 @@ FIRST = 100
 """Messages that are looked at for one that has waited for long, of each that is below a supervisor."""
 MOST = 200
 """Events of the address that are looked at, the newest."""
-PARTS = "ftm"
-"""The name of what has the parts of a protected actor."""
 MOST_DEEPER = 10_000
-"""Actors further below that are looked at."""
+"""Actors below a supervisor that are looked at."""
 MOST_TEXT = 300
 """Characters of an error that a sentence quotes."""
 ADVICE = (DIVERGES, IN_VAIN)
@@ -117,7 +115,7 @@ class ChildNow(msgspec.Struct, frozen=True):
     Attributes:
         name: the last part of its address.
         state: "running", "suspended", "starting", "restarting", "recovering", "stopping" or "stopped".
-        turn: the message whose turn waits, by type; "" if none does, or the child lives in another process.
+        turn: the message whose turn waits, by type; "" if none does, or another process has not said so.
         turn_seconds: how long that turn has taken so far.
         turn_at: the line of the user's code at which it waits.
         awaited: the address for which its start waits, because it is bound to it.
@@ -235,7 +233,7 @@ class Evidence(msgspec.Struct, frozen=True):
         status: how the actor is; None if nobody lives there, or it does not say.
         queued_before: how many messages waited a moment before the status was taken; None: nobody has looked.
         asks: its asks that have no answer yet, as far as this process knows them.
-        allowance: what its supervisor allows, if that is in this process.
+        allowance: what its supervisor allows, if that says so.
         quarantined: its messages in quarantine.
         suspects_gap: whether events were left out lately because there were too many.
         below: its children, if it is a supervisor that answers.
@@ -324,12 +322,16 @@ class Told(msgspec.Struct, frozen=True):
         queued_before: how many messages waited a moment before; None: nobody has looked.
         overview: of a supervisor, its state.
         silence: that nothing was said.
+        above: the state of its supervisor, if that lives in another process.
+        below: how those below it are that live in other processes, by address.
     """
 
     status: Status | None = None
     queued_before: int | None = None
     overview: dict[str, Any] = {}
     silence: Silence | None = None
+    above: dict[str, Any] = {}
+    below: dict[str, Status] = {}
 
 
 def collect(
@@ -342,7 +344,7 @@ def collect(
     while above:
         ancestors += answer(recorder, question(literal(above), kinds=GAVE_UP_KINDS, limit=5)).events
         above = above.rpartition("/")[0]
-    children = _children(node, address, told.overview)
+    children = _children(node, address, told)
     return Evidence(
         address,
         node.clock.wall(),
@@ -355,7 +357,7 @@ def collect(
         told.queued_before,
         # All mailboxes are searched for them, and only of a turn that goes on is anything said of its asks.
         outstanding(node, address) if told.status is not None and told.status.turn is not None else [],
-        None if cell is None else _allowance(cell),
+        None if cell is None else _allowance(cell) or _own_allowance(told.above),
         [put_aside(one) for one in quarantined],
         recorder.is_in_storm,
         Below(
@@ -367,7 +369,7 @@ def collect(
         ),
         Below(
             _deeper(recorder, address),
-            [] if cell is None else _deeper_now(cell),
+            [] if cell is None else _deeper_now(cell, told.below),
             _deeper_ended(node, recorder, address),
         ),
         _own_allowance(told.overview),
@@ -386,18 +388,19 @@ def _awaited(node: Node, address: str) -> str:
     return "" if one is None else one.awaited
 
 
-def _children(node: Node, address: str, overview: dict[str, Any]) -> list[ChildNow]:
-    """A supervisor's children, each with its turn if that can be seen from here."""
+def _children(node: Node, address: str, told: Told) -> list[ChildNow]:
+    """A supervisor's children, each with its turn if that can be seen from here, or its process has said so."""
     return [
-        _child_now(node.find(f"{address}/{name}"), name, about) for name, about in overview.get("children", {}).items()
+        _child_now(node.find(path := f"{address}/{name}"), name, about, told.below.get(path))
+        for name, about in told.overview.get("children", {}).items()
     ]
 
 
-def _child_now(cell: Cell | None, name: str, about: dict[str, Any]) -> ChildNow:
+def _child_now(cell: Cell | None, name: str, about: dict[str, Any], told: Status | None) -> ChildNow:
     state, awaited = str(about["state"]), str(about.get("awaited", ""))
     if cell is None or cell.is_dead:
         return ChildNow(name, state, awaited=awaited)
-    status = status_of(cell)
+    status = told or status_of(cell)
     state = status.state if (state, status.state) == ("running", "suspended") else state
     return _now(cell, status, name, state, awaited)
 
@@ -424,7 +427,7 @@ def _ended_below(recorder: HistoryRecorder, address: str, children: list[ChildNo
 def _deeper(recorder: HistoryRecorder, address: str) -> list[PastEvent]:
     """What weighs much of that which happened further below."""
     events = answer(recorder, question(f"{literal(address)}/*/*/**", kinds=DEEPER_KINDS, limit=MOST)).events
-    return _not_over(recorder, [event for event in events if not _is_part(event.address, address)])
+    return _not_over(recorder, [event for event in events if not is_part(event.address, address)])
 
 
 def _not_over(recorder: HistoryRecorder, events: list[PastEvent]) -> list[PastEvent]:
@@ -445,27 +448,28 @@ def _is_over(recorder: HistoryRecorder, event: PastEvent) -> bool:
     return bool(lives) and (lives[-1].started or 0.0) > event.at and not is_fault(lives[-1])
 
 
-def _is_part(path: str, address: str) -> bool:
-    """Whether it is a part of a protected actor, which tells of its parts itself."""
-    return PARTS in path[len(address) :].split("/")
-
-
-def _deeper_now(cell: Cell) -> list[ChildNow]:
+def _deeper_now(cell: Cell, told: dict[str, Status]) -> list[ChildNow]:
     """Who does not get on further below."""
     found: list[ChildNow] = []
-    level = deque(below for one in _below(cell) for below in _below(one))
+    for one in below(cell):
+        if one.is_dead or not is_deeper(one.path, cell.path):
+            continue
+        status = told.get(one.path) or status_of(one)
+        now = _now(one, status, one.path, status.state)
+        if now.state == "suspended" or now.is_long:
+            found.append(now)
+    return found
+
+
+def below(cell: Cell) -> Iterator[Cell]:
+    """Who is below somebody, as far as this process knows, the nearest first; without parts of protected actors."""
+    level = deque(_below(cell))
     for _ in range(MOST_DEEPER):
         if not level:
             break
         one = level.popleft()
         level += _below(one)
-        if one.is_dead:
-            continue
-        status = status_of(one)
-        now = _now(one, status, one.path, status.state)
-        if now.state == "suspended" or now.is_long:
-            found.append(now)
-    return found
+        yield one
 
 
 def _below(cell: Cell) -> list[Cell]:
@@ -480,7 +484,7 @@ def _deeper_ended(node: Node, recorder: HistoryRecorder, address: str) -> dict[s
         for path, life in recorder.lives.last_deeper(address)
         if life.is_over
         and is_fault(life)
-        and not _is_part(path, address)
+        and not is_part(path, address)
         and ((cell := node.find(path)) is None or cell.is_dead)
     }
 

@@ -8,13 +8,20 @@ from typing import TypeAlias
 
 import msgspec
 
-from ...supervision.children import WITH_THE_SYSTEM
+from ...supervision.children import WITH_SUPERVISOR
+from .authors import PROGRAM
 from .past_event import PastEvent, Plain
+from .paths import is_part
 
 MOST_LIVES = 16
 """Lives that are kept of one address, the newest."""
 MOST_ADDRESSES = 10_000
 """Addresses whose lives are kept; beyond, whoever had nothing happen for longest is forgotten."""
+
+WITH_THE_SYSTEM = "the system has ended"
+"""Why a life has ended, in words, whose supervisor has ended with the whole system."""
+KILLED_BY_REF = "it was killed by `ref.kill()`"
+"""Why a life has ended that somebody has killed, in words."""
 
 
 class PastLife(msgspec.Struct):
@@ -108,18 +115,21 @@ class LivesByAddress:
 
     def at(self, address: str) -> list[PastLife]:
         """The lives of an address, oldest first; copies."""
+        self._end_with_above(address)
         return [msgspec.structs.replace(life) for life in self._known.get(address, ())]
 
     def last_below(self, address: str) -> Iterator[tuple[str, PastLife]]:
         """The newest life of each address directly below this one, with that address."""
         for path, known in self._known.items():
             if path.rpartition("/")[0] == address:
+                self._end_with_above(path)
                 yield path, known[-1]
 
     def last_deeper(self, address: str) -> Iterator[tuple[str, PastLife]]:
         """The newest life of each address below the ones directly below this one, with that address."""
         for path, known in self._known.items():
             if is_deeper(path, address):
+                self._end_with_above(path)
                 yield path, known[-1]
 
     def __len__(self) -> int:
@@ -136,6 +146,8 @@ class LivesByAddress:
         if learn is None:
             return
         if event.kind in ROOT:
+            for path in self._known:
+                self._end_with_above(path)
             for known in self._known.values():
                 _root_ended(known, event)
             return
@@ -146,7 +158,28 @@ class LivesByAddress:
                 self._known.popitem(last=False)
         else:
             self._known.move_to_end(event.address)
+            if event.kind in BEHIND_AN_END:
+                self._end_with_above(event.address)
         learn(lives, event)
+        if not lives:
+            del self._known[event.address]
+
+    def _end_with_above(self, path: str) -> None:
+        """End a life that has ended with the one above it: of those that are killed so, no event tells."""
+        lives, above = self._known.get(path), path.rpartition("/")[0]
+        if not lives or is_part(path) or not above:
+            return
+        self._end_with_above(above)
+        life = lives[-1]
+        is_killed = life.reason_kind == "Killed" and not life.by and life.allowed is None
+        if life.started is None or (life.is_over and not is_killed):
+            return
+        for ended in self._known.get(above, ()):
+            if ended.reason_kind != "FailedOver" and ended.ended is not None and ended.ended > life.started:
+                if not life.is_over:
+                    life.ended, life.reason, life.reason_kind = ended.ended, ended.reason, ended.reason_kind
+                life.by, life.because = above, WITH_SUPERVISOR
+                return
 
 
 def _now(lives: Lives) -> PastLife:
@@ -226,8 +259,12 @@ def _crashed(lives: Lives, event: PastEvent) -> None:
 
 def _process_died(lives: Lives, event: PastEvent) -> None:
     life = _last(lives)
-    if life.pid in (0, _number(event, "pid")):
-        life.pid = _number(event, "pid") or 0
+    if life.pid not in (0, _number(event, "pid")):
+        return
+    life.pid = _number(event, "pid") or 0
+    if life.started is None and not life.is_over and not life.by and _text(event, "reason_kind") == "Killed":
+        lives.pop()  # It was not wanted before it began; if that was a failure, it is told.
+    else:
         _end(life, event)
 
 
@@ -250,8 +287,9 @@ def _stopped(lives: Lives, event: PastEvent) -> None:
         lives.append(life := PastLife(number))
     _end(life, event)
     if _text(event, "because") == WITH_THE_SYSTEM and life.reason_kind == "Shutdown":
-        life.reason_kind, life.by = "SystemStopped", "the program"
+        life.reason_kind, life.by = "SystemStopped", PROGRAM
     _blame(life, event)
+    life.by = life.by or PROGRAM  # No actor has called for it.
 
 
 def _linked_end(lives: Lives, event: PastEvent) -> None:
@@ -263,7 +301,7 @@ def _linked_end(lives: Lives, event: PastEvent) -> None:
 def _killed(lives: Lives, event: PastEvent) -> None:
     """Its end is told by another event, which comes when it has ended."""
     life = _now(lives)
-    life.by, life.because = _text(event, "by"), "it was killed by `ref.kill()`"
+    life.by, life.because = _text(event, "by"), KILLED_BY_REF
 
 
 def _restarted(lives: Lives, event: PastEvent) -> None:
@@ -274,11 +312,11 @@ def _restarted(lives: Lives, event: PastEvent) -> None:
 
 def _not_started(lives: Lives, event: PastEvent) -> None:
     life = _last(lives)
-    if (life.started is not None and life.is_over) or not lives:
+    has_crashed_in_its_start = life.reason_kind == "Crash" and life.allowed is None
+    if life.started is not None and life.is_over and not has_crashed_in_its_start:
         life = _now(lives)
-    if life.started is None or not life.is_over:
-        life.ended = event.at
-        life.reason, life.reason_kind = _text(event, "reason"), "StartFailed"
+    life.ended = event.at
+    life.reason, life.reason_kind = _text(event, "reason"), "StartFailed"
 
 
 def _recovered(lives: Lives, event: PastEvent) -> None:
@@ -300,7 +338,8 @@ def _quarantined(lives: Lives, event: PastEvent) -> None:
     """The processes that have died in a row had this message in hand."""
     left = _number(event, "deliveries") or 1
     for life in reversed(lives):
-        if left and life.reason_kind in DEATHS:
+        is_dying = not life.is_over and life.started is not None  # Of replicas the end is told behind this.
+        if left and (life.reason_kind in DEATHS or is_dying):
             life.handling = life.handling or _text(event, "message")
             left -= 1
 
@@ -311,12 +350,14 @@ def _root_ended(lives: Lives, event: PastEvent) -> None:
         life = lives[-1]
         life.ended, life.reason = event.at, _text(event, "why") or "the system stopped"
         life.reason_kind = "SystemStopped" if event.kind == "SystemStopped" else "RootKilled"
-        life.by = "the program" if event.kind == "SystemStopped" else ""
+        life.by = PROGRAM if event.kind == "SystemStopped" else ""
 
 
 WITH_THE_ROOT = frozenset({"SystemStopped", "RootKilled"})
 """How lives end that end with the process of the root."""
 ROOT = ("SystemStarted", "SystemStopped")
+BEHIND_AN_END = ("ActorStarted", "ProcessStarted", "MessageQuarantined")
+"""Events that come when the life before is over."""
 DEATHS = frozenset({"Signal", "ForkServerDied", "Exited", "OutOfMemory", "Hung"})
 """Exit reasons of a process that says nothing itself of what it had in hand."""
 LEARN = {

@@ -11,6 +11,8 @@ from ...actors.kernel.ref import ActorRef, Target
 
 LONGEST = 1_000
 """Characters of a pattern."""
+PARTS = "ftm"
+"""The name of what has the parts of a protected actor."""
 _QUOTED = re.compile(r"\\([*?\[\]\\])")
 """A sign that stands for itself."""
 
@@ -67,6 +69,15 @@ def literal(address: str) -> str:
     /app/\[1\]\*
     """
     return "".join(f"\\{sign}" if sign in "*?[]\\" else sign for sign in address)
+
+
+def is_part(path: str, address: str = "") -> bool:
+    """Whether a path below an address is a part of a protected actor, which tells of its parts itself.
+
+    >>> is_part("/app/till/ftm/r1"), is_part("/app/till")
+    (True, False)
+    """
+    return PARTS in path[len(address) :].split("/")
 
 
 def pattern_of(target: Target) -> str:

@@ -8,14 +8,16 @@ from heapq import merge
 from typing import TYPE_CHECKING
 
 from ...actors.events import ActorKilled, ActorStarted, ChildStopped, ChildTerminated, Event, LogLine, Restful
+from ...actors.kernel.cell import RUNNING
 from ...checkpoint.addresses import is_at
+from ...supervision.children import WITH_SUPERVISOR
 from ..last_lines.followers import Followers
 from ..last_lines.line_memory import LineMemory
 from .authors import author
 from .counted_work import COUNTED, count_work
 from .forgetting import telling_of
 from .intake.alike_events import EVERY, AlikeCounter
-from .lives import LivesByAddress
+from .lives import WITH_THE_SYSTEM, LivesByAddress
 from .past_event import UNKEPT, PastEvent, Plain, plain_fields, shortened
 from .tracks import BOUNDS, EventTrack, TrackName, track_of
 from .writer import PACE, HistoryWriter, NoteStore, stored
@@ -93,11 +95,19 @@ class HistoryRecorder:
             by, because = self._expected.pop(event.address)
             fields["by"] = fields.get("by") or by
             fields["because"] = fields.get("because") or because
+        if kind is ChildStopped and fields["because"] == WITH_SUPERVISOR and self._is_ending:
+            fields["by"], fields["because"] = "", WITH_THE_SYSTEM
         if kind is ActorKilled:
-            fields["by"] = fields["by"] or author()
+            fields["by"] = fields["by"] or self._expected.get(event.address, (author(), ""))[0]
         if kind.__name__ in COUNTED:
             fields |= count_work(self._node, event.address)
         self._add(kind.__name__, event.address, fields)
+
+    @property
+    def _is_ending(self) -> bool:
+        """Whether the whole system ends."""
+        root = self._node.root
+        return root is not None and root.state is not RUNNING
 
     def _is_counted(self, event: Event) -> bool:
         """Whether an event is one of many that are alike: a row says in a while how many there were."""

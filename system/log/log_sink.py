@@ -231,7 +231,8 @@ class LogSink:
             if event.reason in crash.reason:
                 return
             crash = None
-        self._write(event, **({} if crash is None else self._describe(crash)))
+        described = {} if crash is None else self._describe(crash)
+        self._write(event, **{**described, "reason": event.reason})  # A process that is of no use is killed.
 
     # -- recoveries -------------------------------------------------------------------------------------------------
 

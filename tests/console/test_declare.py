@@ -218,6 +218,26 @@ async def test_what_is_kept_stays_whatever_it_is(app: hf.ActorSystem) -> None:
         ('["/app/a/b"]\nclass = "tests.system.trees:Counter"', r"its supervisor /app/a has no table in this file"),
         ('["/app/a"]\nclass = "tests.system.trees:Add"', r"line 2, /app/a, class: tests.system.trees:Add is no actor"),
         ('["/app/a"]\nclass = "no_such:Class"', r"/app/a, class: class no_such:Class is not there .*'\)$"),
+        (
+            '["/app/a/"]\nclass = "tests.system.trees:Counter"',
+            r"line 1, /app/a/: there are .* tables named for an address",
+        ),
+        (
+            'below = 5\n["/app/a"]\nclass = "tests.system.trees:Counter"',
+            r"line 1, below: it must be an address .*, not 5$",
+        ),
+        (
+            '["/app/a"]\nclass = "tests.system.trees:Counter"\nnames = ["x", "x"]',
+            r"line 3, /app/a, names: names must have each text once, not \['x', 'x'\]",
+        ),
+        (
+            '["/app/a"]\nclass = "tests.system.trees:Counter"\nnames = [""]',
+            r"line 3, /app/a, names: names must be text without control characters",
+        ),
+        (
+            '["/app/a"]\nclass = "tests.system.trees:Counter"\nrunning = "no"',
+            r"line 3, /app/a, running: running must be True or False, not 'no'",
+        ),
         ('name = "top"\nchildren = []', r"line 1, name: this is one supervisor as hf.load_tree reads it"),
     ],
 )

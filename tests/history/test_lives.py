@@ -72,6 +72,14 @@ def test_a_message_in_quarantine_is_what_the_dead_had_in_hand() -> None:
         ("MessageQuarantined", {"message": "shop.Buy", "deliveries": 2}),
     )
     assert [life.handling for life in lives] == ["", "shop.Buy", "shop.Buy"]
+    first, second = lives_of(
+        ("ActorStarted", {"life": 1}),
+        ("ChildTerminated", SIGKILL),
+        ("ActorStarted", {"life": 2}),
+        ("MessageQuarantined", {"message": "shop.Buy", "deliveries": 2}),
+        ("ChildTerminated", SIGKILL),  # of the last replica
+    )
+    assert (first.handling, second.handling, second.reason_kind) == ("shop.Buy", "shop.Buy", "Signal")
 
 
 def test_a_start_that_fails_is_a_life_that_did_not_begin() -> None:
@@ -84,6 +92,60 @@ def test_a_start_that_fails_is_a_life_that_did_not_begin() -> None:
     assert (second.number, second.started, second.reason, second.reason_kind) == (2, None, "no file", "StartFailed")
     [only] = lives_of(("ChildStartFailed", {"reason": "no file"}))
     assert (only.number, only.started, only.reason_kind) == (1, None, "StartFailed")
+
+
+def test_a_process_that_is_ended_before_its_actor_has_begun_is_no_life() -> None:
+    killed = {"reason": "killed", "reason_kind": "Killed"}
+    assert lives_of(("ProcessStarted", {"pid": 71}), ("ProcessDied", {"pid": 71, **killed})) == []
+    [only] = lives_of(
+        ("ProcessStarted", {"pid": 71}),
+        ("ProcessDied", {"pid": 71, **killed}),
+        ("ChildStartFailed", {"reason": "no class"}),
+    )
+    assert (only.number, only.reason, only.reason_kind) == (1, "no class", "StartFailed")
+    [told] = lives_of(
+        ("ProcessStarted", {"pid": 71}), ("ActorKilled", {"by": "/app"}), ("ProcessDied", {"pid": 71, **killed})
+    )
+    assert (told.by, told.reason_kind) == ("/app", "Killed")
+
+
+def test_a_life_ends_with_the_one_above_it() -> None:
+    lives = LivesByAddress()
+
+    def tell(number: int, kind: str, address: str, **fields: Any) -> None:
+        lives.apply(PastEvent(number, float(number), kind, address, fields))
+
+    crash = {"reason": "KeyError: 7", "reason_kind": "Crash"}
+    for number, address in enumerate(("/app", "/app/s", "/app/s/t", "/app/s/t/one"), 1):
+        tell(number, "ActorStarted", address, life=1)
+    assert not lives.at("/app/s/t/one")[0].is_over
+    tell(5, "ChildTerminated", "/app/s", **crash, restarts=0, allowed=3)
+    [one], [above] = lives.at("/app/s/t/one"), lives.at("/app/s/t")
+    assert (one.ended, one.reason, one.by, one.because) == (5.0, "KeyError: 7", "/app/s/t", "its supervisor has ended")
+    assert (above.ended, above.by) == (5.0, "/app/s")
+    tell(6, "ActorStarted", "/app/s/t/one", life=1)  # Who is above it tells of its start when that is over.
+    tell(7, "ActorStarted", "/app/s/t", life=1)
+    tell(8, "ActorStarted", "/app/s", life=2)
+    assert [[life.is_over for life in lives.at(path)] for path in ("/app/s", "/app/s/t", "/app/s/t/one")] == [
+        [True, False]
+    ] * 3
+    assert not lives.at("/app")[0].is_over
+
+
+def test_a_life_that_begins_anew_has_ended_with_the_one_above_it() -> None:
+    lives = LivesByAddress()
+    for number, (kind, address) in enumerate(
+        [
+            ("ActorStarted", "/app/s"),
+            ("ActorStarted", "/app/s/one"),
+            ("ChildStopped", "/app/s"),
+            ("ActorStarted", "/app/s/one"),
+            ("ActorStarted", "/app/s"),
+        ]
+    ):
+        lives.apply(PastEvent(number, float(number), kind, address, {"life": 1, "by": "/app", "because": "order"}))
+    first, second = lives.at("/app/s/one")
+    assert (first.ended, first.by, second.started, second.is_over) == (2.0, "/app/s", 3.0, False)
 
 
 def test_who_has_ended_a_life() -> None:

@@ -267,6 +267,131 @@ async def test_a_supervisor_says_who_is_suspended_and_who_was_stopped(system: hf
     assert "by a transaction of the program" in text
 
 
+PLACES: dict[str, tuple[Any, dict[str, Any]]] = {
+    "task": ("task", {}),
+    "process": ("task", {"isolation": "process"}),
+    "recorded process": ("task", {"isolation": "process", "recovery": hf.hybrid()}),
+    "below a process": ("process", {}),
+    "recorded below a process": ("process", {"recovery": hf.hybrid()}),
+    "process below a process": ("process", {"isolation": "process"}),
+    "replicas": ("task", {"mechanism": hf.ftm.PBR()}),
+}
+"""Where a child lives: the isolation of its supervisor, and its own options."""
+
+
+async def family(system: hf.ActorSystem, place: str, **options: Any) -> hf.ActorRef[Worker]:
+    """A worker in a place, below /app/family."""
+    isolation, own = PLACES[place]
+    child = worker("one", **{**own, **options})
+    await system.start(hf.supervisor("family", isolation=isolation, intensity=3, period=60.0, children=[child]))
+    return system.ref("/app/family/one", Worker)
+
+
+async def comes_to_say(system: hf.ActorSystem, target: str, words: str) -> str:
+    """What is said of the target as soon as it has these words."""
+    async with asyncio.timeout(10.0):
+        while words not in (text := await said(system, target)):
+            await asyncio.sleep(0.05)
+    return text
+
+
+@pytest.mark.parametrize("place", PLACES)
+async def test_a_supervisor_says_who_does_not_get_on_wherever_that_one_lives(
+    system: hf.ActorSystem, place: str
+) -> None:
+    one = await family(system, place)
+    await system.suspend(one)
+    assert await said(system, "/app/family") == "Its child one is suspended."
+    assert await said(system, "/app") == "Below it, /app/family/one is suspended: ask why of /app/family/one."
+    await system.resume(one)
+    asked = one.ask(Do("wait"), 60.0)
+    told = await comes_to_say(system, "/app/family", "Its child one does not get on: it has been in the turn of ")
+    assert "await asyncio.sleep(60.0)" in told
+    assert "Below it, /app/family/one does not get on" in await said(system, "/app")
+    one.kill()
+    with pytest.raises(hf.HoldfastError):
+        await asked
+
+
+@pytest.mark.parametrize("place", [place for place in PLACES if place != "replicas"])
+@pytest.mark.parametrize("end", ["kill", "stop"])
+async def test_who_ends_with_its_supervisor_is_said_to_wherever_it_lives(
+    system: hf.ActorSystem, place: str, end: str
+) -> None:
+    one = await family(system, place)
+    above = system.ref("/app/family", hf.Supervisor)
+    if end == "kill":
+        above.kill()
+        await until(lambda: system.lives("/app/family/one")[-1].started != system.lives("/app/family/one")[0].started)
+    else:
+        await system.stop(above)
+    first = system.lives("/app/family/one")[0]
+    assert (first.number, first.reason_kind) == (1, "Killed" if end == "kill" else "Shutdown")
+    assert (first.by, first.because) == ("/app/family", "its supervisor has ended")
+    text = await said(system, one)
+    assert re.match(r"/app/family/one was ended by /app/family \d+(\.\d)? s ago: its supervisor has ended\.", text)
+    assert len(system.lives("/app/family/one")) == (2 if end == "kill" else 1)
+
+
+@pytest.mark.parametrize("place", ["task", "process", "below a process"])
+async def test_the_program_is_named_that_has_ended_a_child(system: hf.ActorSystem, place: str) -> None:
+    one = await family(system, place)
+    one.kill()
+    await until(lambda: len(system.lives(one)) > 1)
+    await one.ask(Do("well"), 20.0)
+    await system.ref("/app/family", hf.Supervisor).ask(hf.TerminateChild("one"), 20.0)
+    assert [life.author for life in system.lives(one)] == [
+        "the program (it was killed by `ref.kill()`)",
+        "the program (it was stopped by order)",
+    ]
+
+
+@pytest.mark.parametrize("place", ["task", "below a process", "process below a process"])
+async def test_what_the_supervisor_allows_is_said_wherever_it_lives(system: hf.ActorSystem, place: str) -> None:
+    one = await family(system, place)
+    for _ in range(3):
+        await failed(one, "crash")
+    await one.ask(Do("well"), 20.0)
+    assert (await said(system, one)).endswith("its supervisor allows 3 in 60 s and gives up at the next.")
+    assert [life.number for life in system.lives(one)] == [1, 2, 3, 4]
+
+
+class Unwilling(Worker):
+    """Does not want to be started."""
+
+    def __init__(self) -> None:
+        raise hf.Ignore("not today")
+
+
+class Late(Worker):
+    """Starts once, and then cannot at first."""
+
+    def on_start(self, restored: bool) -> None:
+        if self.ctx.life in (2, 3):
+            raise FileNotFoundError("the file of settings has gone")
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_who_did_not_want_to_be_started_has_not_lived(system: hf.ActorSystem, isolation: Any) -> None:
+    child = hf.child("one", hf.start(Unwilling), isolation=isolation)
+    await system.start(hf.supervisor("family", children=[child]))
+    assert system.lives("/app/family/one") == []
+    assert "nothing is wrong" in await said(system, "/app/family")
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_a_start_that_fails_is_one_life(system: hf.ActorSystem, isolation: Any) -> None:
+    one = await system.start(hf.child("one", hf.start(Late), isolation=isolation))
+    await failed(one, "crash")
+    await one.ask(Do("well"), 20.0)
+    assert [(life.number, life.reason_kind) for life in system.lives(one)] == [
+        (1, "Crash"),
+        (2, "StartFailed"),
+        (3, "StartFailed"),
+        (4, ""),
+    ]
+
+
 @pytest.mark.parametrize("killed_in", ["task", "process"])
 @pytest.mark.parametrize("killer_in", ["task", "process"])
 async def test_whoever_kills_is_named(system: hf.ActorSystem, killer_in: Any, killed_in: Any) -> None:

@@ -129,6 +129,18 @@ async def test_a_child_that_cannot_start_has_one_record_with_the_traceback(recor
     assert "no device" in record["exception"]
 
 
+async def test_a_child_whose_class_its_process_cannot_import_is_logged_with_that_reason(
+    records: list[Record],
+) -> None:
+    here = type("Here", (Fragile,), {"__module__": "__main__"})
+    sys.modules["__main__"].Here = here  # type: ignore[attr-defined]  # as a cell of a notebook does
+    async with hf.ActorSystem() as system:
+        with pytest.raises(hf.StartFailed) as failed:
+            await system.start(hf.child("here", hf.start(here), isolation="process"))
+    (record,) = records
+    assert (record["event"], record["reason"]) == ("child not started", failed.value.reason)
+
+
 async def test_a_recovery_that_fails_has_one_record_for_each_attempt(records: list[Record]) -> None:
     async with hf.ActorSystem(intensity=1000) as system:
         ref = await system.start(hf.child("draws", hf.start(Draws), recovery=hf.hybrid(), backoff=hf.Backoff()))

@@ -4,6 +4,7 @@ import asyncio
 import signal
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -65,6 +66,12 @@ def test_it_returns_what_the_program_returns() -> None:
 async def test_where_an_event_loop_runs_already_it_says_what_to_do() -> None:
     with pytest.raises(hf.SpecError, match="await the coroutine there"):
         hf.run(value())
+
+
+def test_in_another_thread_it_says_what_to_do() -> None:
+    said = r"only the main thread hears of signals: in this one use asyncio\.run"
+    with ThreadPoolExecutor(1) as threads, pytest.raises(hf.SpecError, match=said):
+        threads.submit(hf.run, value()).result()
 
 
 def test_it_runs_on_uvloop() -> None:
