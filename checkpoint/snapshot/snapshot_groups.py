@@ -151,7 +151,7 @@ class Groups:
         return msgspec.structs.replace(group, images=images)
 
     def wait(self, paths: Iterable[str]) -> None:
-        """From now on these homes hold what waits, until `let_go`: what they send would find nobody."""
+        """From now on these homes hold what waits, until `let_go`: what they publish would find nobody."""
         self._waiting.update(paths)
 
     def let_go(self, paths: Iterable[str]) -> None:

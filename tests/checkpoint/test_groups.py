@@ -120,6 +120,44 @@ async def test_an_ask_under_way_is_answered_once_more(isolation: str, store: str
         assert await two.ask(Seen(), timeout=20.0) == ["hello"]
 
 
+class Crier(Doer):
+    async def step(self, verb: str, arg: str, peer: hf.ActorRef[Any] | None) -> Any:
+        if verb == "publish":
+            return await self.ctx.publish("/words", Note(arg))
+        return await super().step(verb, arg, peer)
+
+
+class Late(Doer):
+    """Takes long to start."""
+
+    async def on_start(self, restored: bool) -> None:
+        await asyncio.sleep(0.2)
+
+    @hf.on(Note)
+    @hf.subscribe("/words")
+    def note(self, message: Note) -> int:
+        return super().note(message)
+
+
+@pytest.mark.pairs
+@pytest.mark.parametrize("way", ["ask", "publish"])
+async def test_nobody_begins_before_all_are_there(isolation: str, store: str | None, gate: Path, way: str) -> None:
+    """Else the first one publishes what the second one, who is still to be started, does not hear."""
+    async with running(store) as system:
+        one = await start(system, isolation, "one", hf.start(Crier), recovery=RECOVERY)
+        two = await start(system, isolation, "two", hf.start(Late), recovery=RECOVERY)
+        one.tell(Do([f"gate {gate}"]))
+        await until(gate.exists)
+        one.tell(Do([f"{way} hello"], two))  # It waits behind the gate.
+        asked = one.ask(Do([]), timeout=20.0)
+        await system.checkpoint_group([one, two], name="before")
+        Path(f"{gate}.open").touch()
+        await asked
+        await system.restore_group("before")
+        await one.ask(Do([]), timeout=20.0)  # Behind what was under way.
+        assert await two.ask(Seen(), timeout=20.0) == ["hello"]
+
+
 async def test_the_way_back_leads_over_restarts_of_the_root(isolation: str, tmp_path: Path) -> None:
     store = f"sqlite:{tmp_path / 'app.db'}"
     async with running(store) as system:

@@ -1921,7 +1921,7 @@ CHECKS = {
         "        self._waiting.update(paths)\n",
         "",
         "tests/checkpoint/test_groups.py",
-        "test_no_sum_is_lost and task",
+        "test_nobody_begins_before_all_are_there and publish",
     ),
     "R78: messages under way belong to the cut": Check(
         "checkpoint/home/input_ledger.py",
