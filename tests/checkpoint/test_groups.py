@@ -135,7 +135,7 @@ class Late(Doer):
 
     @hf.on(Note)
     @hf.subscribe("/words")
-    def note(self, message: Note) -> int:
+    def note(self, message: Note) -> int | hf.ReplyHandle[int]:
         return super().note(message)
 
 

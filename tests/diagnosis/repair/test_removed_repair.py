@@ -204,8 +204,8 @@ CHECKS = {
         "diagnosis/repair/repairer.py",
         "        if back := tuple(name for name, life in awaited.items() if self._life(name) != life):\n",
         "        if back := tuple[str, ...]():\n",
-        WORSE,
-        "test_repair_is_no_worse_than_supervision_alone and slow",
+        SOON,
+        "started_just_now",
     ),
     "who hangs in its end is given no time to begin": Check(
         "diagnosis/repair/repairer.py",

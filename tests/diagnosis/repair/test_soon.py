@@ -27,6 +27,9 @@ class End(hf.Message):
     """End, and hang in that."""
 
 
+class Crash(hf.Message): ...
+
+
 class Tick(hf.Message): ...
 
 
@@ -46,6 +49,10 @@ class Part(hf.Actor):
     @hf.on(End)
     def _end(self, message: End) -> None:
         self.ctx.stop()
+
+    @hf.on(Crash)
+    def _crash(self, message: Crash) -> None:
+        raise RuntimeError("as it was told")
 
     async def on_stop(self, reason: Any) -> None:
         if reason == hf.NORMAL:
@@ -105,24 +112,34 @@ class Gauge(Observer):
 async def system() -> AsyncIterator[hf.ActorSystem]:
     async with hf.ActorSystem("t", log=False, seed=1) as system:
         kinds = {"feed": Feed, "matcher": Matcher, "cache": Cache, "asker": Asker}
-        children = [hf.child(name, hf.start(kind)) for name, kind in kinds.items()]
+        slow = {"feed": hf.Backoff(initial=1.0, jitter=0.0)}
+        children = [hf.child(name, hf.start(kind), backoff=slow.get(name)) for name, kind in kinds.items()]
         await system.start(hf.supervisor("all", children=children, intensity=1000))
         yield system
 
 
-async def struck(
-    system: hf.ActorSystem, name: str, message: hf.Message[Any], within: float, policy: Policy | None = None
-) -> tuple[str, float]:
-    """Watch, with repair on; the first action behind this message, and after how many seconds it has begun."""
+async def acted(
+    system: hf.ActorSystem, name: str, within: float, *messages: hf.Message[Any]
+) -> list[tuple[str, float]]:
+    """Watch, with repair on; the actions behind these messages, each with the seconds after which it has begun.
+
+    Between the messages are 1.7 seconds.
+    """
     told = list[hf.Message[Any]]()
     system.spawn(hf.start(Secretary, told, [], asyncio.Event()))
-    await diagnosis.watch(system, repair="on", policy=policy)
+    await diagnosis.watch(system, repair="on")
     await asyncio.sleep(20.0)
     began = asyncio.get_running_loop().time()
-    system.ref(f"/t/all/{name}", Part).tell(message)
+    for number, message in enumerate(messages):
+        await asyncio.sleep(1.7 * (number > 0))
+        system.ref(f"/t/all/{name}", Part).tell(message)
     await asyncio.sleep(within)
-    (first, *_) = [one for one in told if isinstance(one, ActionBegan)]
-    return str(first.step), first.time - began
+    return [(str(one.step), one.time - began) for one in told if isinstance(one, ActionBegan)]
+
+
+async def struck(system: hf.ActorSystem, name: str, message: hf.Message[Any], within: float) -> tuple[str, float]:
+    """The first of them."""
+    return (await acted(system, name, within, message))[0]
 
 
 async def test_who_falls_silent_is_restarted_when_that_is_seen(system: hf.ActorSystem) -> None:
@@ -140,6 +157,11 @@ async def test_who_hangs_in_its_end_is_given_no_time_to_begin(system: hf.ActorSy
     """Its supervisor has five seconds for that end, and begins nothing."""
     step, seconds = await struck(system, "feed", End(), 20.0)
     assert (step, seconds < 6.3) == ("restart_child(all/feed)", True), seconds
+
+
+async def test_who_was_started_just_now_is_given_time_to_begin(system: hf.ActorSystem) -> None:
+    """It had been silent, and crashed then: what was seen says nothing of the life that has begun."""
+    assert await acted(system, "feed", 20.0, Fail(), Crash()) == []
 
 
 @pytest.mark.parametrize(
