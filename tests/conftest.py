@@ -46,7 +46,7 @@ from holdfast.testing.guard.process_leaks import GRACE, end_processes, is_of_tes
 from tests.pairs import covering, spread
 from tests.supervision.programs import Ends
 from tests.waits import Waits
-from tests.warm import WarmServers, warm_popen
+from tests.warm import WARM, WarmServers, bury, warm_popen
 
 # Installed, the plugin comes by its entry point; in a checkout whose metadata is older it is named here. Not both:
 # pytest refuses to register it under two names.
@@ -295,6 +295,8 @@ def nothing_left(warm_servers: WarmServers | None) -> Iterator[None]:
 
     This fixture is set up before the event loop of the test and torn down after it has been closed.
     """
+    if WARM:
+        bury()
     leaks = Leaks()
     leaks.close()  # What is made meanwhile is the guard's to tell, in the tests that have one.
     yield

@@ -83,6 +83,16 @@ def umask() -> int:
     return found
 
 
+def bury() -> None:
+    """Wait for children that have ended and that nobody waits for; for between tests.
+
+    What a program had started outlives it, and is adopted by whoever has another one forked at that moment.
+    """
+    with contextlib.suppress(ChildProcessError):
+        while (found := os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT)) and found.si_pid not in WARM:
+            os.waitpid(found.si_pid, os.WNOHANG)
+
+
 class Forked:
     """A child of this process that it has not started itself: as much of a `Popen` as `ForkServer` needs."""
 

@@ -389,10 +389,10 @@ class RegistryActor(Actor):
         """Queue for the lock of a key; whoever has asked first gets it."""
         item = self.ctx._item
         handle = self.ctx.reply_handle()
-        sender = item.sender if isinstance(item, Ask) else None
+        sender, chain = (item.sender, item.chain) if isinstance(item, Ask) else (None, ())
         if sender is not None and not is_living(sender, message.life):
             return None
-        turn = item.chain[0][1] if item.chain else -1
+        turn = chain[0][1] if chain else -1
         claim = Claim(message.key, message.ticket, sender, message.life, turn, handle)
         waiting = self._book.locks.setdefault(message.key, deque())
         waiting.append(claim)

@@ -20,7 +20,7 @@ from holdfast.actors.process.fork import fork_server, launch
 from holdfast.actors.process.fork.fork_server import ForkServer
 from tests.actors.process.facts import descriptors
 from tests.actors.process.waiting import until
-from tests.warm import Forked, WarmServers, own_children, warm_popen
+from tests.warm import Forked, WarmServers, bury, own_children, warm_popen
 
 ENTRY = "tests.actors.process.facts:main"
 
@@ -217,3 +217,14 @@ async def test_a_warm_program_is_started_from_any_loop(warm_servers: WarmServers
     assert said == repeated == "what it reads"
     assert int(few) < int(many), "it was forked"
     assert (status, also) == (3, 3)
+
+
+def test_whoever_was_adopted_and_has_ended_is_buried() -> None:
+    """As those are whose parent ends while something is forked from the warm process."""
+    with subprocess.Popen([sys.executable, "-c", "pass"]) as ended, subprocess.Popen(["sleep", "60"]) as other:
+        assert os.waitid(os.P_PID, ended.pid, os.WEXITED | os.WNOWAIT) is not None
+        bury()
+        with pytest.raises(ChildProcessError):
+            os.waitpid(ended.pid, os.WNOHANG)
+        assert other.poll() is None
+        other.kill()
