@@ -84,7 +84,7 @@ class Case:
         advised: the advice for each candidate.
         useless: places of actions that were seen not to help.
         others: when each component was started by somebody else.
-        awaited: whose supervisor was at work when repair looked, with the number of the life that they had then.
+        awaited: whose supervisor was at work when repair looked, with the number of the life that was up then, or 0.
         held: what repair waits for, as it was last told.
         doubted: since when a candidate is blamed although its actors answer.
     """

@@ -16,6 +16,7 @@ from typing import Final
 from ...actors.errors import HoldfastError
 from ...actors.events import ActorStarted, ChildRestarted, Event
 from ...actors.kernel.actor import Actor, on, subscribe
+from ...actors.kernel.cell import RUNNING
 from ...actors.kernel.message import Message
 from ...supervision.arbiter import SUPERVISOR, Arbiter, Hand, arbiter_of, covers
 from ..engine import Diagnosis, State
@@ -398,7 +399,7 @@ class Repairer(Actor):
             return deciding.Wait(deciding.SOON, wakes=False) if case.has_heard(busy) else deciding.Enter(held=busy)
         awaited = {name: case.awaited.pop(name) for name in sorted(case.awaited.keys() & set(bad))}
         # Of who ended by itself, and hangs in that, its supervisor has begun nothing.
-        if back := tuple(name for name, life in awaited.items() if self._life(name) != life):
+        if back := tuple(name for name, life in awaited.items() if self._life(name) not in (0, life)):
             await self._give_time(back)
             return deciding.Enter()
         problem = problem_for(self._model, self._actions, policy, self._ledger, at, bad, self._alone(), self._is_free)
@@ -434,9 +435,9 @@ class Repairer(Actor):
         return deciding.judge_results(bad, outcome, results, self.now(), policy)
 
     def _life(self, component: str) -> int:
-        """The number of the life that a component has, or had last; -1 if there is none to be seen."""
+        """The number of the life of a component that is up; 0 if none is, or if it is still starting."""
         cell = self.ctx._cell.node.find(self._addresses.get(component, ""))
-        return -1 if cell is None else cell.life
+        return cell.life if cell is not None and cell.state is RUNNING and cell.host.is_up(cell) else 0
 
     async def _give_time(self, names: tuple[str, ...]) -> None:
         """Their supervisor has done its work just now: what was seen while it did says nothing of what has begun."""
