@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +13,7 @@ from pathlib import Path
 import pytest
 
 import holdfast as hf
-from holdfast.actors.process.program import keeper_watch
+from holdfast.actors.process.program import external_program, keeper_watch
 from tests.actors.process.waiting import next_event, until
 from tests.supervision.programs import FAMILY, STUBBORN, Ends, family, hang, info, keeper_of, python
 from tests.warm import own_children
@@ -23,6 +24,12 @@ signal.signal(signal.SIGUSR1, lambda *_: os._exit(3))
 while True:
     print("up", flush=True)
     time.sleep(0.05)
+"""
+LATE = """
+import os, sys, time
+while not os.path.exists(sys.argv[1]):
+    time.sleep(0.01)
+os.execv(sys.argv[2], sys.argv[2:])
 """
 HUNG_SECONDS = 0.3
 """In place of two seconds, so that the tests need not wait for so long."""
@@ -128,15 +135,21 @@ async def test_its_descendants_end_with_it(system: hf.ActorSystem, ends: Ends, f
 
 
 @pytest.mark.parametrize("fate", [stop, hang])
-async def test_one_whose_keeper_is_stuck_while_it_starts_it(system: hf.ActorSystem, fate: Fate, tmp_path: Path) -> None:
-    let = tmp_path / "let"  # It is not up before its keeper is stuck.
-    waits = f"import os, time\nwhile not os.path.exists({str(let)!r}):\n    time.sleep(0.01)\n"
-    starting = asyncio.create_task(system.start(python(waits + BEATS, ready="up")))
+async def test_one_whose_keeper_is_stuck_while_it_starts_it(
+    system: hf.ActorSystem, fate: Fate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    let, command = tmp_path / "let", external_program.keeper_command  # It begins when it is stuck.
+    monkeypatch.setattr(
+        external_program,
+        "keeper_command",
+        lambda *fds: [sys.executable, "-I", "-S", "-c", LATE, str(let), *command(*fds)],
+    )
+    starting = asyncio.create_task(system.start(python(BEATS, ready="up")))
     await until(lambda: len(own_children()) == 1)
     fate(own_children()[0].pid)
     begin = time.monotonic()
+    let.touch()
     if fate is stop:
-        let.touch()
         await starting
     else:
         with pytest.raises(hf.StartFailed, match="its keeper ended with code -9"):
