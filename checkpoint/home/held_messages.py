@@ -368,6 +368,7 @@ class Intake:
         bound: what a message has to pass; None: nothing.
         holding: stands as the bound while the actor is recovered.
         inlets: the topics that have a rule of their own then.
+        class_topics: those that the actor's class subscribes to; its own are beside the state.
         last: the last input that was to be safe before it is fed.
         between: stands as the actor's cell while nobody lives there, and its supervisor may bring it back.
     """
@@ -375,6 +376,7 @@ class Intake:
     bound: HomeBound | Holding | None = None
     holding: Holding | None = None
     inlets: dict[str, Inlet] = dataclasses.field(default_factory=dict)
+    class_topics: tuple[str, ...] = ()
     last: Input | None = None
     between: Between | None = None
 

@@ -171,9 +171,10 @@ class JournalHome(RecordedHome):
         switch = self.switch
         assert switch is not None
         end_wait(switch)  # It was subscribed until now, so that nothing was missed.
-        before, switch.class_topics = switch.class_topics, tuple(topics)
+        intake, before = switch.intake, switch.intake.class_topics
+        intake.class_topics = tuple(topics)
         switch.leave_topics(before)
-        for topic in (*switch.class_topics, *switch.topics):
+        for topic in (*intake.class_topics, *switch.topics):
             cell.node.topics.subscribe(topic, inlet(switch, topic))
 
     def has_class(self, cell: Cell, kind: type[Actor]) -> None:
@@ -403,7 +404,7 @@ class JournalHome(RecordedHome):
             return
         restarting = self.parent.is_restarting(cell)
         waits = restarting and self.method.records and self._outlives(cell)
-        topics = (*self.switch.class_topics, *self.switch.topics)
+        topics = (*self.switch.intake.class_topics, *self.switch.topics)
         for topic in topics:
             cell.node.topics.unsubscribe(topic, inlet(self.switch, topic))
         end_wait(self.switch)  # Of the life before, if this one has not come so far.

@@ -110,7 +110,6 @@ class Switch:
         self.calls = PendingCalls(self)
         self.timers = Timers(self)
         self.topics: dict[str, None] = {}
-        self.class_topics: tuple[str, ...] = ()  # those of its class; `topics` are its own
         self.ties = DurableTies(self)
         self.outputs = Outputs(self)
         self.limit = Limit(self)
@@ -137,7 +136,7 @@ class Switch:
     def leave_topics(self, topics: Iterable[str]) -> None:
         """Have nothing come in any more on those topics that neither the class subscribes to nor the actor."""
         for topic in topics:
-            if self.cell is not None and topic not in self.class_topics and topic not in self.topics:
+            if self.cell is not None and topic not in self.intake.class_topics and topic not in self.topics:
                 self.node.topics.unsubscribe(topic, inlet(self, topic))
 
     @property

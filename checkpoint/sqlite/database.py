@@ -122,8 +122,3 @@ def refuse_broken(db: sqlite3.Connection, path: str) -> None:
 def text_of(data: bytes) -> str:
     """A text as SQLite has it, also where it is none: the checksums judge it."""
     return data.decode(errors="surrogateescape")
-
-
-def result_code(error: Exception) -> int:
-    """Primary SQLite result code; 0 if SQLite itself did not object."""
-    return int(getattr(error, "sqlite_errorcode", 0)) & 0xFF

@@ -16,14 +16,14 @@ from typing import Final, NamedTuple
 from ...actors.errors import HoldfastError
 from ..journal import DamagedStore, Entry, StaleEpoch, StoreFailed
 from .append_log import FrontLog, LogSealed, NoRoom, Row, following
-from .database import connect, create_database, result_code
+from .database import connect, create_database
 from .entry_chains import Chain, StoreContents, StoreScan, create_chain
 from .in_hand import InputsInHand
 from .ownership import StoreClaim, refuse_copy
 from .position_mark import PositionMark
 from .sealing import format_of, may_have_log
 from .snapshot_files import SnapshotFiles, sync
-from .store_parts import Parts
+from .store_parts import Parts, result_code
 from .wal import Wal, room_wanted
 
 INSERT: Final = "INSERT INTO entries VALUES (?, ?, ?, ?, ?, ?)"

@@ -14,9 +14,9 @@ from time import monotonic
 from typing import Final, NamedTuple
 
 from ..journal import DamagedStore, StoreInUse
-from .database import refuse_broken, refuse_foreign, result_code
+from .database import refuse_broken, refuse_foreign
 from .row_codec import crc_of
-from .store_parts import Parts, identity_of, lock_holder
+from .store_parts import Parts, identity_of, lock_holder, result_code
 from .wal import shorten
 
 _KILL_SECONDS: Final = 10.0

@@ -180,7 +180,7 @@ class Parts:
         try:
             (application,) = self.peek(lambda db: db.execute("PRAGMA application_id").fetchone(), with_wal=False)
         except sqlite3.DatabaseError as error:
-            if getattr(error, "sqlite_errorcode", 0) != sqlite3.SQLITE_NOTADB:
+            if result_code(error) != sqlite3.SQLITE_NOTADB:
                 return  # The opening says what is wrong.
             application, what = 0, "no SQLite database"
         if application != APPLICATION:
@@ -479,3 +479,8 @@ def holder_of(files: set[str]) -> int | None:
         if "WRITE" in words and words[-3] in files and int(words[-4]) > 0:
             return int(words[-4])
     return None
+
+
+def result_code(error: Exception) -> int:
+    """Primary SQLite result code; 0 if SQLite itself did not object."""
+    return int(getattr(error, "sqlite_errorcode", 0)) & 0xFF

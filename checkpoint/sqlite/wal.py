@@ -15,7 +15,8 @@ from collections.abc import Callable
 from time import monotonic
 from typing import Final
 
-from .database import connect, result_code
+from .database import connect
+from .store_parts import result_code
 
 LEAST_BYTES: Final = 4 << 20
 """As long as this the file may always be, and as long it stays when it is begun anew."""

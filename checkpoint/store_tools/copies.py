@@ -24,13 +24,12 @@ import msgspec
 from ..journal import NotCopied
 from ..snapshot.snapshot_record import Meta
 from ..sqlite.block_packs import Packs
-from ..sqlite.database import result_code
 from ..sqlite.entry_chains import CHAINS, Chain
 from ..sqlite.open_store import INSERT
 from ..sqlite.ownership import StoreRow, write_store_row
 from ..sqlite.sealing import Bytes, format_of, snapshot_place
 from ..sqlite.snapshot_files import SnapshotFiles, for_us, no_link, sync, write_durably
-from ..sqlite.store_parts import COPY_NOTE, NAME, NOTE, Parts, copy_notes, mark_of, new_cipher, part_names
+from ..sqlite.store_parts import COPY_NOTE, NAME, NOTE, Parts, copy_notes, mark_of, new_cipher, part_names, result_code
 from ..store_key import StoreKey, read_store_key
 from .resealing import Resealing
 from .store_view import Overtaken, StoreView, look

@@ -18,13 +18,13 @@ from ...actors.errors import HoldfastError
 from ..journal import DamagedStore, StoreFailed
 from ..sqlite.append_log import FrontLog, Row, batches_in, following
 from ..sqlite.block_packs import Packs
-from ..sqlite.database import refuse_foreign, result_code, text_of
+from ..sqlite.database import refuse_foreign, text_of
 from ..sqlite.ownership import StoreRow, living, read_store_row
 from ..sqlite.position_mark import read_mark, refuse_missing
 from ..sqlite.read_back import ChainReader
 from ..sqlite.sealing import may_have_log
 from ..sqlite.snapshot_files import SnapshotFiles
-from ..sqlite.store_parts import Parts, StoreIdentity, identity_of
+from ..sqlite.store_parts import Parts, StoreIdentity, identity_of, result_code
 
 T = TypeVar("T")
 _LOOKS: Final = 10

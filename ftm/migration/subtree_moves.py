@@ -441,7 +441,7 @@ class ToSubtree(IntoSubtree):
         switch, node, bound = self._switch, cell.node, luggage.bound if self._switch is None else None
         self.parent.arriving = None
         if switch is not None:
-            for topic in dict.fromkeys([*switch.class_topics, *switch.topics]):
+            for topic in dict.fromkeys([*switch.intake.class_topics, *switch.topics]):
                 node.topics.unsubscribe(topic, inlet(switch, topic))
                 node.topics.subscribe(topic, cell)
         if bound is not None:
