@@ -295,6 +295,7 @@ class Conclude(Order):
             elif self.suspended is not None:
                 mailbox.resume(cell)
             mailbox.resume(cell, mailbox.BY_TRANSACTION)
+            hold.let_go()
 
     def pack(self, where: str) -> dict[str, Any]:
         return {"attempt": self.attempt, "is_in_force": self.is_in_force, "suspended": self.suspended}

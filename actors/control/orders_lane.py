@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 from typing import TYPE_CHECKING, Any
 
 from ..errors import ControlFailed, HoldfastError, error_text, type_name
@@ -27,7 +28,7 @@ class OrderAsked(Message[bytes]):
 
 ORDERED = OrderAsked()
 LOOK_AGAIN = 0.01
-"""Seconds between two looks at whether the transaction that an order waits for is over."""
+"""Seconds between two looks at whether the life is there that an order waits for, and that a transaction holds."""
 MOST_TOLD = MAX_BYTES - 4096
 """Bytes of what an order may give: with what stands around it, it fits into one message."""
 
@@ -71,8 +72,11 @@ class QueuedOrder(Item):
             return None  # Whoever gave it was told that it was not carried out.
         if ctx._postpones(call):
             return None
-        if call.order.is_behind_transactions and mailbox.is_held_by_transaction(ctx._cell):
-            ctx._cell.node.loop.call_later(LOOK_AGAIN, call._again, ctx._cell)
+        hold = mailbox.held_by_transaction(ctx._cell) if call.order.is_behind_transactions else None
+        if hold is not None:
+            if not hold.behind:  # A life may end, or leave, while it is held.
+                ctx._cell.node.loop.call_later(LOOK_AGAIN, hold.let_go)
+            hold.behind.append(functools.partial(call._again, ctx._cell))
             return None
         ask.started = True
         try:

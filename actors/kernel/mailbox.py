@@ -316,12 +316,13 @@ NOTHING = _Nothing()
 class Hold(Item):
     """Stands between the commands and the messages of a suspended actor: none of those is run, none is out of order."""
 
-    __slots__ = ("attempt", "prepared")
+    __slots__ = ("attempt", "behind", "prepared")
     is_command = True
 
     def __init__(self) -> None:
         self.attempt = 0  # of a transaction that holds the actor too
         self.prepared: Any = None  # and what it has prepared for it
+        self.behind: list[Callable[[], None]] = []  # what waits until that lets it go, in order
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
@@ -329,6 +330,13 @@ class Hold(Item):
         queue_of(cell).appendleft(item)
         cell.scheduled = False
         return LEAVE
+
+
+    def let_go(self) -> None:
+        """Have those that wait look again."""
+        behind, self.behind = self.behind, []
+        for look in behind:
+            look()
 
 
 BY_USER, BY_TRANSACTION, BY_ITSELF = 1, 2, 4
@@ -364,10 +372,10 @@ def held(cell: Cell) -> Hold | None:
     return next((item for item in cell.queue or () if type(item) is Hold), None)
 
 
-def is_held_by_transaction(cell: Cell) -> bool:
-    """Whether a transaction holds an actor of this process, and has tried what is to become of it."""
+def held_by_transaction(cell: Cell) -> Hold | None:
+    """What holds an actor of this process for a transaction, which has tried what is to become of it."""
     hold = held(cell)
-    return hold is not None and hold.attempt != 0
+    return hold if hold is not None and hold.attempt else None
 
 
 class BoundedQueue(deque[Any]):

@@ -123,9 +123,11 @@ async def test_a_state_that_is_replaced_while_the_actor_is_held_is_replaced_behi
     given: list[asyncio.Future[Any]] = []
 
     async def beside(running: hf.ActorSystem) -> None:
-        given.append(asyncio.ensure_future(running.replace_state(one, doubled, timeout=IN_TIME)))
-        await asyncio.sleep(0)
-        await running.get_status(one)  # The order has come to where the actor lives.
+        for change in (doubled, hundred):
+            given.append(asyncio.ensure_future(running.replace_state(one, change, timeout=IN_TIME)))
+            await asyncio.sleep(0)
+            await running.get_status(one)  # The order has come to where the actor lives.
+            await asyncio.sleep(0.005)  # Each has looked again at a time of its own.
         if fails:
             raise hf.HoldfastError("given up")
 
@@ -135,6 +137,7 @@ async def test_a_state_that_is_replaced_while_the_actor_is_held_is_replaced_behi
             change.step(Stumble(beside))
     except hf.TransactionFailed:
         assert fails
+    given.append(asyncio.ensure_future(system.replace_state(one, hundred, timeout=IN_TIME)))
     after = 10 if fails else 210
-    assert (await given[0])["count"] == after
-    assert await one.ask(Add(0), IN_TIME) == after
+    assert [(await order)["count"] for order in given] == [after, after + 100, after + 200]
+    assert await one.ask(Add(0), IN_TIME) == after + 200

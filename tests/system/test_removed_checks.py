@@ -2159,8 +2159,15 @@ CHECKS = {
     ),
     "what a transaction has tried of an actor is not overtaken by an order": Check(
         "actors/control/orders_lane.py",
-        "if call.order.is_behind_transactions and",
-        "if False and",
+        "ctx._cell) if call.order.is_behind_transactions else None",
+        "ctx._cell) if False else None",
+        "tests/system/test_held_meanwhile.py",
+        "test_a_state_that_is_replaced_while",
+    ),
+    "orders that a transaction holds up are obeyed in the order in which they came": Check(
+        "actors/control/orders.py",
+        "            hold.let_go()\n",
+        "",
         "tests/system/test_held_meanwhile.py",
         "test_a_state_that_is_replaced_while",
     ),
