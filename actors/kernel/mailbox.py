@@ -331,7 +331,6 @@ class Hold(Item):
         cell.scheduled = False
         return LEAVE
 
-
     def let_go(self) -> None:
         """Have those that wait look again."""
         behind, self.behind = self.behind, []
